@@ -1,0 +1,209 @@
+"""All of the companion that flies, without tasks, sockets or clocks: bytes and times in, bytes out.
+
+The app on the vehicle, the lockstep runner and replay call the same methods; they differ only in who carries the bytes.
+A scan is processed in three steps, so that the heavy one can run off the event loop: `on_lidar_packet` hands out whole
+scans, `process_scan` registers one, `accept_scan` takes the result in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from companion import topics
+from companion.config import CompanionConfig
+from companion.lidar.ouster import OusterDecoder
+from companion.mapping import Mapper
+from companion.mavlink.session import MavlinkSession
+from companion.messages import (
+    AttitudeSample,
+    Event,
+    LidarScan,
+    OdometryEstimate,
+    OperatorCommand,
+    RangefinderSample,
+    SetpointKind,
+    VehicleState,
+    VolumeReport,
+    WallRanges,
+)
+from companion.navigator import Navigator, NavigatorInput, NavigatorOutput
+from companion.navigator.guard import Guard, GuardInput
+from companion.odometry import Odometry, ScanResult
+from companion.volume import estimate_volume
+
+Tap = Callable[[topics.Topic, int, object], None]
+
+
+def _no_tap(topic: topics.Topic, t_ns: int, message: object) -> None:
+    """Nobody listens."""
+
+
+@dataclass(slots=True)
+class _Beat:
+    """A deadline that comes again each period, without drift; late beats are not made up for."""
+
+    period_ns: int
+    next_ns: int = 0
+
+    def due(self, t_ns: int) -> bool:
+        if t_ns < self.next_ns:
+            return False
+        self.next_ns += self.period_ns
+        if self.next_ns <= t_ns:
+            self.next_ns = t_ns + self.period_ns
+        return True
+
+
+@dataclass(slots=True)
+class Flight:
+    """One flight of one vehicle. Raises nothing on bad input: it is dropped and counted where it arrives."""
+
+    config: CompanionConfig
+    lidar_metadata_json: str | None = None
+    tap: Tap = _no_tap
+    decoder: OusterDecoder = field(init=False)
+    session: MavlinkSession = field(init=False)
+    odometry: Odometry = field(init=False)
+    navigator: Navigator = field(init=False)
+    guard: Guard = field(init=False)
+    mapper: Mapper = field(init=False)
+    walls: WallRanges | None = field(init=False, default=None)
+    estimate: OdometryEstimate | None = field(init=False, default=None)
+    navigation: NavigatorOutput | None = field(init=False, default=None)
+    keyframes: list[OdometryEstimate] = field(init=False, default_factory=list)
+    events: list[Event] = field(init=False, default_factory=list)
+    scans: int = field(init=False, default=0)
+    _commands: list[OperatorCommand] = field(init=False, default_factory=list)
+    _mapped_ns: int | None = field(init=False, default=None)
+    _t_scan_ns: int | None = field(init=False, default=None)
+    _odometry_beat: _Beat = field(init=False)
+    _setpoint_beat: _Beat = field(init=False)
+
+    def __post_init__(self) -> None:
+        config = self.config
+        if self.lidar_metadata_json is not None:
+            self.decoder = OusterDecoder(self.lidar_metadata_json)
+        else:
+            self.decoder = OusterDecoder.from_config(config.lidar)
+        self.session = MavlinkSession(config.mavlink)
+        self.odometry = Odometry(config)
+        self.navigator = Navigator(config)
+        self.guard = Guard(config)
+        self.mapper = Mapper(config)
+        self._odometry_beat = _Beat(round(1e9 / config.mavlink.odometry_rate_hz))
+        self._setpoint_beat = _Beat(round(1e9 / config.mavlink.setpoint_rate_hz))
+
+    # ---- in ---------------------------------------------------------------------------------------------------------
+
+    def on_lidar_packet(self, data: bytes, t_ns: int, source: tuple[str, int] | None = None) -> list[LidarScan]:
+        """Scans that this packet completed, in order: each goes to `process_scan`."""
+        return self.decoder.receive(data, t_ns, source)
+
+    def on_mavlink(self, data: bytes, t_ns: int, source: tuple[str, int] | None = None) -> None:
+        for message in self.session.receive(data, t_ns, source):
+            if isinstance(message, AttitudeSample):
+                self.odometry.on_attitude(message)
+                self.tap(topics.ATTITUDE, t_ns, message)
+            elif isinstance(message, RangefinderSample):
+                self.odometry.on_rangefinder(message)
+                self.tap(topics.RANGEFINDER, t_ns, message)
+            elif isinstance(message, Event):
+                self._tell(message)
+            elif isinstance(message, OperatorCommand):
+                self.on_operator(message)
+
+    def on_operator(self, command: OperatorCommand) -> None:
+        self._commands.append(command)
+        self.tap(topics.OPERATOR, command.t_ns, command)
+
+    def process_scan(self, scan: LidarScan) -> ScanResult:
+        """Level, deskew and register one scan: the heavy step; may run in a thread, one scan at a time."""
+        return self.odometry.on_scan(scan)
+
+    def accept_scan(self, result: ScanResult, t_ns: int) -> bool:
+        """Take a registered scan in. True if it belongs in the map: then `mapper.add` it, where it holds up nothing."""
+        estimate = result.estimate
+        self.scans += 1
+        self.estimate = estimate
+        self.walls = result.wall_ranges
+        self._t_scan_ns = estimate.t_scan_ns
+        self.session.send_wall_ranges(result.wall_ranges)
+        self.tap(topics.WALLS, t_ns, result.wall_ranges)
+        if estimate.is_keyframe:
+            self.keyframes.append(estimate)
+            self.tap(topics.KEYFRAME, t_ns, estimate)
+        for event in result.events:
+            self._tell(event)
+        return self._belongs_in_map(estimate)
+
+    def poll(self, t_ns: int) -> None:
+        """Do what is due: estimates, setpoints, heartbeats. Call at `next_deadline_ns`, or more often."""
+        self.session.poll(t_ns)
+        if self._odometry_beat.due(t_ns):
+            estimate = self.odometry.predict(t_ns)
+            if estimate is not None:
+                self.estimate = estimate
+                if not self.guard.is_silent:
+                    self.session.send_odometry(estimate, t_ns)
+                self.tap(topics.ESTIMATE, t_ns, estimate)
+        if self._setpoint_beat.due(t_ns):
+            self._navigate(t_ns)
+
+    # ---- out --------------------------------------------------------------------------------------------------------
+
+    def take_output(self) -> list[bytes]:
+        """MAVLink frames to send to the flight controller, in order."""
+        return self.session.data_to_send()
+
+    def next_deadline_ns(self) -> int:
+        return min(self._odometry_beat.next_ns, self._setpoint_beat.next_ns, self.session.next_deadline_ns())
+
+    @property
+    def is_finished(self) -> bool:
+        return self.navigation is not None and self.navigation.finished
+
+    def measure(self) -> VolumeReport:
+        """The volume from the map so far: seconds of work."""
+        return estimate_volume(self.mapper.point_map(), self.config.volume)
+
+    # ---- within -----------------------------------------------------------------------------------------------------
+
+    def _navigate(self, t_ns: int) -> None:
+        state: VehicleState = self.session.vehicle_state(t_ns)
+        self.tap(topics.VEHICLE, t_ns, state)
+        commands, self._commands = tuple(self._commands), []
+        output = self.navigator.step(
+            t_ns, NavigatorInput(estimate=self.estimate, walls=self.walls, vehicle=state, commands=commands)
+        )
+        self.navigation = output
+        verdict = self.guard.check(
+            output.setpoint, t_ns,
+            GuardInput(estimate=self.estimate, walls=self.walls, vehicle=state, commands=commands),
+        )  # fmt: skip
+        for request in (*output.requests, *verdict.requests):
+            self.session.request(request)
+            self.tap(topics.REQUEST, t_ns, request)
+        for event in (*output.events, *verdict.events):
+            self._tell(event)
+        if output.setpoint is not None:
+            self.tap(topics.WANTED, t_ns, output.setpoint)
+        setpoint = verdict.setpoint
+        if setpoint is not None and setpoint.kind is not SetpointKind.SILENT:
+            self.session.send_setpoint(setpoint)
+            self.tap(topics.SETPOINT, t_ns, setpoint)
+
+    def _belongs_in_map(self, estimate: OdometryEstimate) -> bool:
+        if estimate.quality <= 0 or not estimate.converged:
+            return False
+        period_ns = round(self.config.mapping.scan_period_s * 1e9)
+        due = self._mapped_ns is None or estimate.t_scan_ns - self._mapped_ns >= period_ns
+        if due or estimate.is_keyframe:
+            self._mapped_ns = estimate.t_scan_ns
+            return True
+        return False
+
+    def _tell(self, event: Event) -> None:
+        self.events.append(event)
+        self.session.send_event(event)
+        self.tap(topics.EVENT, event.t_ns, event)
