@@ -1,0 +1,309 @@
+"""Ouster packets to scans, sans-IO. The only file of the flight code that knows ouster-sdk.
+
+The vendor's SDK gives the packet's layout, its checksum and the beam geometry; the fields of a whole turn are then
+read in one numpy step. Facts on packets: Ouster "Sensor Data" chapter of the firmware user manual, v2.3 to v3.1.
+"""
+
+# mypy: disable-error-code="name-defined,attr-defined"
+# (ouster.sdk.core re-exports its names without saying so in a way that strict type checking accepts)
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from ouster.sdk import core
+
+from companion.config import LidarConfig
+from companion.errors import FileFormatError
+from companion.lidar.sensor_clock import SensorClock
+from companion.messages import LidarGeometry, LidarScan
+
+DROP_REASONS = ("size", "header", "checksum", "foreign", "repeated", "reordered", "frozen")
+NO_CHECKSUM = (0, 0xDEADBEEF0000C0DE)  # what firmware 2.2 and 2.3 leaves there (recorded OS-0-32 and OS-1-128)
+SILENCE_NS = 500_000_000  # after this without a packet, another start of the same sensor is believed
+PACKET_TYPE_LIDAR = 1
+FRAMES_BACK = 8  # a frame this little older than the current one is late, not a counter that started anew
+
+_STANDARD_HEADER = struct.Struct("<HHQ")  # type, frame id, then 24 bits init id and 40 bits serial number
+_COLUMN_START = struct.Struct("<QH")  # stamp, measurement id
+
+
+@dataclass(frozen=True, slots=True)
+class _Pixel:
+    """Where range and signal lie in a pixel's bytes: numpy type, byte offset; range = (word & mask) << shift, mm."""
+
+    range_type: str
+    range_mask: int
+    range_shift: int
+    signal_type: str
+    signal_offset: int
+
+
+# The strongest return's range and signal by UDP profile; low data rate profiles carry no signal: reflectivity instead.
+_WIDE = _Pixel("<u4", 0x7FFFF, 0, "<u2", 6)
+_NARROW = _Pixel("<u2", 0x7FFF, 3, "u1", 2)
+_PIXELS = {
+    "LEGACY": replace(_WIDE, range_mask=0xFFFFF),
+    "RNG19_RFL8_SIG16_NIR16": _WIDE,
+    "RNG19_RFL8_SIG16_NIR16_ZONE16": _WIDE,
+    "RNG19_RFL8_SIG16_NIR16_DUAL": replace(_WIDE, signal_offset=8),
+    "RNG15_RFL8_NIR8": _NARROW,
+    "RNG15_RFL8_NIR8_DUAL": _NARROW,
+    "FUSA_RNG15_RFL8_NIR8_DUAL": _NARROW,
+}
+
+
+def sensor_info(metadata: str | LidarConfig) -> core.SensorInfo:
+    """The sensor as its metadata JSON says, or one with the configured beams where no metadata is known.
+
+    Raises: FileFormatError: not a metadata JSON of an Ouster sensor.
+    """
+    if isinstance(metadata, str):
+        try:
+            return core.SensorInfo(metadata)
+        except (RuntimeError, ValueError) as error:
+            raise FileFormatError(f"LiDAR metadata: expected the JSON of an Ouster sensor, got: {error}") from error
+    info = core.SensorInfo.from_default(core.LidarMode(metadata.columns, metadata.rate_hz))
+    data_format = info.format
+    data_format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
+    data_format.pixels_per_column = metadata.rows
+    data_format.pixel_shift_by_row = [0] * metadata.rows
+    info.format = data_format
+    altitudes = np.linspace(metadata.elevation_max_deg, metadata.elevation_min_deg, metadata.rows)
+    info.beam_altitude_angles = altitudes.tolist()
+    info.beam_azimuth_angles = [0.0] * metadata.rows
+    return info
+
+
+def geometry_of(info: core.SensorInfo) -> LidarGeometry:
+    """Direction and offset of every measurement, (rows, columns), in the Ouster sensor frame: z up through the lid,
+    x away from the connector, origin at the foot of the housing. Staggered: a column is what was measured at one time.
+    """
+    lut = core.XYZLut(info, use_extrinsics=False)
+    shape = (info.h, info.w, 3)
+    scaled = np.asarray(lut.direction, dtype=np.float64).reshape(shape)
+    directions = scaled / np.linalg.norm(scaled, axis=2, keepdims=True)
+    elevation = np.radians(np.asarray(info.beam_altitude_angles, dtype=np.float64))
+    return LidarGeometry(
+        directions=directions,
+        offsets_m=np.asarray(lut.offset, dtype=np.float64).reshape(shape).copy(),
+        elevation_rad=elevation,
+        horizontal_row=int(np.argmin(np.abs(elevation))),
+    )
+
+
+class OusterDecoder:
+    """Packets in, scans out; what is not a sound packet of this sensor is dropped and counted, never raised.
+
+    A scan completes when its last missing packet came, or when the next frame begins; columns that never came are
+    told by `column_valid`. Times are the companion's, from the sensor's own stamps (SensorClock). The sensor is the
+    one whose serial number the metadata says, or else the first that is heard; its address and start number
+    (init id) hold until it has been silent for half a second.
+    """
+
+    def __init__(self, metadata: str | LidarConfig) -> None:
+        info = sensor_info(metadata)
+        profile = str(info.format.udp_profile_lidar)
+        if profile not in _PIXELS:
+            raise FileFormatError(f"LiDAR profile {profile}: expected one of {', '.join(_PIXELS)}")
+        self.info = info
+        self.geometry = geometry_of(info)
+        self.dropped: dict[str, int] = dict.fromkeys(DROP_REASONS, 0)
+        self.packets = 0
+        self.scans = 0
+        self.restarts = 0
+        self.clock = SensorClock()
+        self._format = core.PacketFormat.from_info(info)
+        self._pixel = _PIXELS[profile]
+        self._is_standard = info.format.header_type == core.HeaderType.STANDARD and profile != "LEGACY"
+        self._has_checksum = profile != "LEGACY"
+        self._columns_per_packet = int(info.format.columns_per_packet)
+        self._expected_packets = int(info.format.lidar_packets_per_frame())
+        self._period_ns = round(1e9 / (int(info.format.fps) * info.w))
+        self._serial = int(info.sn or 0)
+        self._init_id: int | None = None
+        self._host: str | None = None
+        self._t_last_ns: int | None = None
+        self._dtype = _packet_dtype(self._format, self._pixel, info.h, profile)
+        slots = -(-info.w // self._columns_per_packet)
+        self._bytes = np.zeros((slots, self._format.lidar_packet_size), dtype=np.uint8)
+        self._received = np.zeros(slots, dtype=np.bool_)
+        self._frame_id: int | None = None
+        self._is_open = False
+        self._is_restarted = False
+        self._last: LidarScan | None = None
+
+    @classmethod
+    def from_config(cls, cfg: LidarConfig) -> OusterDecoder:
+        """For a sensor whose metadata is not at hand: evenly spread beams as configured."""
+        return cls(cfg)
+
+    def receive(self, packet: bytes, t_ns: int, source: tuple[str, int] | None = None) -> list[LidarScan]:
+        """The scans that this datagram completes: none, one, or (a new frame's only packet) two.
+
+        Args:
+            packet: UDP payload as it came. t_ns: companion time of its arrival. source: (host, port), if known.
+        """
+        self.packets += 1
+        if len(packet) != self._format.lidar_packet_size:
+            return self._drop("size")
+        array = np.frombuffer(packet, dtype=np.uint8)
+        kind, frame_id, init_id, serial = self._read_header(packet, array)
+        stamp, measurement = _COLUMN_START.unpack_from(packet, self._format.packet_header_size)
+        if kind != PACKET_TYPE_LIDAR or measurement >= self.info.w:
+            return self._drop("header")
+        if self._has_checksum and not self._is_sound(array):
+            return self._drop("checksum")
+        if not self._is_ours(init_id, serial, source, t_ns):
+            return self._drop("foreign")
+        self._t_last_ns = t_ns
+        self.clock.update(stamp + (self._columns_per_packet - 1) * self._period_ns, t_ns)
+        return self._place(array, frame_id, measurement // self._columns_per_packet)
+
+    def _drop(self, reason: str) -> list[LidarScan]:
+        self.dropped[reason] += 1
+        return []
+
+    def _read_header(self, packet: bytes, array: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+        """(packet type, frame id, init id, serial number)."""
+        if self._is_standard:
+            kind, frame_id, identity = _STANDARD_HEADER.unpack_from(packet)
+            return kind, frame_id, identity & 0xFFFFFF, identity >> 24
+        fmt = self._format
+        return PACKET_TYPE_LIDAR, int(fmt.frame_id(array)), int(fmt.init_id(array)), int(fmt.prod_sn(array))
+
+    def _is_sound(self, array: NDArray[np.uint8]) -> bool:
+        stored = self._format.crc(array)
+        return stored is None or stored in NO_CHECKSUM or stored == self._format.calculate_crc(array)
+
+    def _is_ours(self, init_id: int, serial: int, source: tuple[str, int] | None, t_ns: int) -> bool:
+        if self._serial and serial != self._serial:
+            return False
+        host = None if source is None else source[0]
+        is_known = init_id == self._init_id and (host is None or self._host is None or host == self._host)
+        if not is_known:
+            if self._t_last_ns is not None and t_ns - self._t_last_ns < SILENCE_NS:
+                return False
+            if self._init_id is not None and init_id != self._init_id:
+                self.restarts += 1
+                self._is_restarted = True
+                self.clock = SensorClock()
+            self._init_id = init_id
+        self._serial = serial
+        self._host = host or self._host
+        return True
+
+    def _place(self, array: NDArray[np.uint8], frame_id: int, slot: int) -> list[LidarScan]:
+        done: list[LidarScan] = []
+        if frame_id != self._frame_id or self._is_restarted:
+            if self._is_older(frame_id) and not self._is_restarted:
+                return self._drop("reordered")
+            done += self._finish()
+            self._frame_id = frame_id
+            self._received[:] = False
+            self._is_open, self._is_restarted = True, False
+        if self._received[slot] or not self._is_open:
+            self.dropped["repeated"] += 1
+            return done
+        self._bytes[slot] = array
+        self._received[slot] = True
+        if np.count_nonzero(self._received) >= self._expected_packets:
+            done += self._finish()
+        return done
+
+    def _is_older(self, frame_id: int) -> bool:
+        if self._frame_id is None:
+            return False
+        behind = (self._frame_id - frame_id) % (int(self._format.max_frame_id) + 1)
+        return 0 < behind <= FRAMES_BACK
+
+    def _finish(self) -> list[LidarScan]:
+        """Close the frame: its scan, unless there is none or the sensor repeats itself (FAULTS: LiDAR stuck)."""
+        if not self._is_open or self._frame_id is None:
+            return []
+        self._is_open = False
+        scan = self._decode(self._frame_id)
+        last, self._last = self._last, scan
+        if last is not None and _is_same(last, scan):
+            return self._drop("frozen")
+        self.scans += 1
+        return [scan]
+
+    def _decode(self, frame_id: int) -> LidarScan:
+        rows, columns = self.info.h, self.info.w
+        column = self._bytes[self._received].view(self._dtype).reshape(-1)["column"].reshape(-1)
+        measurement = column["measurement_id"].astype(np.intp)
+        is_valid = ((column["status"] & 1) == 1) & (measurement < columns)
+        measurement = measurement[is_valid]
+        pixel = column["pixel"][is_valid]
+        range_mm = np.zeros((columns, rows), dtype=np.uint32)
+        range_mm[measurement] = (pixel["range"] & self._pixel.range_mask).astype(np.uint32) << self._pixel.range_shift
+        signal = np.zeros((columns, rows), dtype=np.float32)
+        signal[measurement] = pixel["signal"]
+        column_valid = np.zeros(columns, dtype=np.bool_)
+        column_valid[measurement] = True
+        stamps = np.zeros(columns, dtype=np.int64)
+        stamps[measurement] = column["stamp"][is_valid].astype(np.int64)
+        t_column = self._fill_stamps(stamps, column_valid) + (self.clock.offset_ns or 0)
+        return LidarScan(
+            t_ns=int(t_column[-1]),
+            frame_id=frame_id,
+            t_column_ns=t_column,
+            range_m=np.ascontiguousarray(range_mm.T.astype(np.float32) / np.float32(1000.0)),
+            signal=np.ascontiguousarray(signal.T),
+            column_valid=column_valid,
+            geometry=self.geometry,
+        )
+
+    def _fill_stamps(self, stamps: NDArray[np.int64], is_valid: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Sensor time of every column: lost ones from the nearest before (or after) at the nominal turn rate."""
+        known = np.flatnonzero(is_valid)
+        if len(known) == 0:
+            newest = (self._t_last_ns or 0) - (self.clock.offset_ns or 0)
+            return newest + (np.arange(len(stamps)) - len(stamps) + 1) * np.int64(self._period_ns)
+        if len(known) == len(stamps):
+            return stamps
+        index = np.arange(len(stamps))
+        nearest = known[np.maximum(np.searchsorted(known, index, side="right") - 1, 0)]
+        filled: NDArray[np.int64] = stamps[nearest] + (index - nearest) * np.int64(self._period_ns)
+        return filled
+
+
+def _is_same(a: LidarScan, b: LidarScan) -> bool:
+    """Whether two scans carry the very same measurements. Noise of range and signal makes that impossible in life; two
+    scans in which nothing came back are not counted."""
+    return bool(np.array_equal(a.range_m, b.range_m) and np.array_equal(a.signal, b.signal) and np.any(b.range_m))
+
+
+def _packet_dtype(fmt: core.PacketFormat, pixel: _Pixel, rows: int, profile: str) -> np.dtype[np.void]:
+    """A packet as a numpy record, from the sizes that the SDK states."""
+    is_legacy = profile == "LEGACY"
+    pixel_size = (fmt.col_size - fmt.col_header_size - fmt.col_footer_size) // rows
+    pixel_type = np.dtype(
+        {
+            "names": ["range", "signal"],
+            "formats": [pixel.range_type, pixel.signal_type],
+            "offsets": [0, pixel.signal_offset],
+            "itemsize": pixel_size,
+        }
+    )
+    status_offset = fmt.col_size - fmt.col_footer_size if is_legacy else 10  # legacy: all ones in the column's footer
+    column_type = np.dtype(
+        {
+            "names": ["stamp", "measurement_id", "status", "pixel"],
+            "formats": ["<u8", "<u2", "<u4" if is_legacy else "<u2", (pixel_type, (rows,))],
+            "offsets": [0, 8, status_offset, fmt.col_header_size],
+            "itemsize": fmt.col_size,
+        }
+    )
+    return np.dtype(
+        {
+            "names": ["column"],
+            "formats": [(column_type, (fmt.columns_per_packet,))],
+            "offsets": [fmt.packet_header_size],
+            "itemsize": fmt.lidar_packet_size,
+        }
+    )
