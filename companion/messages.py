@@ -308,3 +308,5 @@ class VolumeReport:
     floor_z_m: Array
     cell_state: NDArray[np.int8]
     warnings: tuple[str, ...] = ()
+    footprint_m: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (V, 2) walls as fitted, or the map's extent
+    error_budget_m3: tuple[tuple[str, float], ...] = ()  # 1 sigma of each part of the interval
