@@ -72,6 +72,4 @@ class SensorClock:
 
 def _drains(delays_ns: list[int]) -> bool:
     """Whether packets that waited are read faster than they were sent: every one less late than the one before."""
-    return (
-        all(b < a for a, b in zip(delays_ns, delays_ns[1:], strict=False)) and delays_ns[0] - delays_ns[-1] > EARLY_NS
-    )
+    return all(b < a for a, b in pairwise(delays_ns)) and delays_ns[0] - delays_ns[-1] > EARLY_NS
