@@ -1,0 +1,237 @@
+"""The store seen from above: outline, obstacles, and what may not be said of them in a mission file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from simbridge import piles
+
+if TYPE_CHECKING:
+    from simbridge.config import Column, Footprint, Pilasters, Start, WorldConfig
+
+Array = NDArray[np.float64]
+
+VEHICLE_RADIUS_M = 0.4  # rotor hub at 0.28 m and half a 10 inch propeller
+MIN_START_TO_WALL_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Obstacle:
+    """Something that stands on the floor. half_m: (x, y, z) before turning; a round one has x = y = its radius."""
+
+    name: str
+    center: tuple[float, float]
+    half_m: tuple[float, float, float]
+    yaw_rad: float
+    is_round: bool
+    foot_z: float
+
+    @property
+    def top_z(self) -> float:
+        return self.foot_z + 2.0 * self.half_m[2]
+
+    def outline(self) -> Any:
+        """Its shapely polygon."""
+        if self.is_round:
+            return shapely.Point(self.center).buffer(self.half_m[0], quad_segs=16)
+        return shapely.transform(
+            shapely.box(-self.half_m[0], -self.half_m[1], self.half_m[0], self.half_m[1]), self._to_world
+        )
+
+    def distance_m(self, point: Array) -> float:
+        """From a point in `world` to its hull, 0 inside."""
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        dx, dy = float(point[0]) - self.center[0], float(point[1]) - self.center[1]
+        above = max(abs(float(point[2]) - self.foot_z - self.half_m[2]) - self.half_m[2], 0.0)
+        if self.is_round:
+            return math.hypot(max(math.hypot(dx, dy) - self.half_m[0], 0.0), above)
+        along = max(abs(c * dx + s * dy) - self.half_m[0], 0.0)
+        across = max(abs(-s * dx + c * dy) - self.half_m[1], 0.0)
+        return math.sqrt(along**2 + across**2 + above**2)
+
+    def _to_world(self, points: Array) -> Array:
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return np.asarray(points @ np.array([[c, s], [-s, c]]) + np.asarray(self.center))
+
+
+def outline(footprint: Footprint) -> Any:
+    """The hall's shapely polygon, corners counter-clockwise in the order of the file (edge i starts at corner i)."""
+    return shapely.Polygon(corners(footprint))
+
+
+def corners(footprint: Footprint) -> Array:
+    """(N, 2) corners as given, without a repeated last one."""
+    if isinstance(footprint, tuple):
+        points = np.asarray(footprint, dtype=np.float64)
+        return points[:-1] if len(points) > 3 and np.array_equal(points[0], points[-1]) else points
+    angle = 2.0 * math.pi * np.arange(footprint.sides) / footprint.sides
+    radius, center = footprint.circle.radius_m, np.asarray(footprint.circle.center)
+    return np.asarray(center + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+def largest_wall_distance_m(footprint: Footprint) -> float:
+    """The largest D with any place that far from every wall: radius of the largest circle inside."""
+    return float(shapely.maximum_inscribed_circle(outline(footprint), 0.01).length)
+
+
+def floor_z(world: WorldConfig, x: Array, y: Array) -> Array:
+    """Height of the bare floor."""
+    middle = outline(world.footprint).centroid
+    return np.asarray(world.floor_slope[0] * (x - middle.x) + world.floor_slope[1] * (y - middle.y))
+
+
+def obstacles(world: WorldConfig) -> tuple[Obstacle, ...]:
+    """Pilasters, columns and boxes, in this order."""
+    found = [
+        _obstacle(f"pilasters[{i}][{k}]", world, center, (half[0], half[1]), yaw, False, None)
+        for i, spec in enumerate(world.pilasters)
+        for k, (center, half, yaw) in enumerate(_pilasters(world, spec))
+    ]
+    found += [_column(f"columns[{i}]", world, column) for i, column in enumerate(world.columns)]
+    found += [
+        _obstacle(
+            f"boxes[{i}]",
+            world,
+            b.center,
+            (b.size_m[0] / 2, b.size_m[1] / 2),
+            math.radians(b.yaw_deg),
+            False,
+            b.size_m[2],
+        )
+        for i, b in enumerate(world.boxes)
+    ]
+    return tuple(found)
+
+
+def _column(name: str, world: WorldConfig, column: Column) -> Obstacle:
+    is_round = column.radius_m is not None
+    size = column.size_m or (2.0 * (column.radius_m or 0.0),) * 2
+    half = (size[0] / 2, size[1] / 2)
+    return _obstacle(name, world, column.center, half, math.radians(column.yaw_deg), is_round, column.height_m)
+
+
+def _obstacle(
+    name: str,
+    world: WorldConfig,
+    center: tuple[float, float],
+    half: tuple[float, float],
+    yaw_rad: float,
+    is_round: bool,
+    height_m: float | None,
+) -> Obstacle:
+    """Standing on the lowest floor under it, up to height_m above its centre's floor (none: the ceiling)."""
+    z = float(floor_z(world, np.array(center[0]), np.array(center[1])))
+    reach = math.hypot(*half) * math.hypot(*world.floor_slope)
+    top = world.height_m if height_m is None else min(z + height_m, world.height_m)
+    foot = z - reach
+    return Obstacle(
+        name=name, center=center, half_m=(*half, (top - foot) / 2), yaw_rad=yaw_rad, is_round=is_round, foot_z=foot
+    )
+
+
+def _pilasters(world: WorldConfig, spec: Pilasters) -> list[tuple[tuple[float, float], tuple[float, float], float]]:
+    """(centre, half size, yaw) of each: half in the wall, evenly spaced, none at the corners."""
+    points = corners(world.footprint)
+    walls = range(len(points)) if spec.wall == "all" else [spec.wall]
+    found = []
+    for wall in walls:
+        if wall >= len(points):
+            continue  # refused by check_world
+        a, b = points[wall], points[(wall + 1) % len(points)]
+        length = math.dist(a, b)
+        count = max(round(length / spec.spacing_m) - 1, 0)
+        yaw = math.atan2(b[1] - a[1], b[0] - a[0])
+        for k in range(count):
+            middle = a + (b - a) * (k + 1) / (count + 1)
+            found.append(((float(middle[0]), float(middle[1])), (spec.width_m / 2, spec.depth_m), yaw))
+    return found
+
+
+def check_world(world: WorldConfig) -> None:
+    """Raises: ValueError: parts that do not fit together; the text begins with the key and says what is allowed."""
+    hall = outline(world.footprint)
+    if not hall.is_valid or hall.area < 1.0:
+        reason = shapely.is_valid_reason(hall) if not hall.is_valid else f"its area is {hall.area:.2f} m2"
+        raise ValueError(
+            f"footprint: crosses or touches itself, or is too small ({reason}); "
+            "allowed is a simple polygon: corners in order along the wall, no edge crossing another"
+        )
+    count = len(corners(world.footprint))
+    for i, spec in enumerate(world.pilasters):
+        if spec.wall != "all" and not 0 <= spec.wall < count:
+            raise ValueError(f"pilasters[{i}].wall: {spec.wall} is no wall; allowed are 0 to {count - 1}, or all")
+    for obstacle in obstacles(world):
+        outside = obstacle.outline().difference(hall.buffer(0.01)).area
+        if outside > 1e-3 and not obstacle.name.startswith("pilasters"):
+            raise ValueError(
+                f"{obstacle.name}: reaches outside the footprint at {obstacle.center}; it must stand within the walls"
+            )
+    for i, pile in enumerate(world.piles):
+        _check_pile(f"piles[{i}]", pile, hall)
+
+
+def _check_pile(name: str, pile: piles.Pile, hall: Any) -> None:
+    base = piles.outline(pile)
+    inside = base.intersection(hall).area
+    if inside < 0.02 * base.area:
+        raise ValueError(f"{name}: lies outside the footprint; it must stand within the walls, or lean on one")
+    if not pile.leaning and not hall.buffer(0.05).covers(base):
+        reach = max(hall.distance(shapely.Point(x, y)) for x, y in base.exterior.coords)
+        raise ValueError(
+            f"{name}: reaches up to {reach:.1f} m outside the footprint; move it inward, make it smaller, "
+            "or set leaning: true to let the walls cut it"
+        )
+
+
+def check_start(world: WorldConfig, start: Start) -> None:
+    """Raises: ValueError: the vehicle cannot stand there."""
+    if isinstance(start, tuple):
+        problem = start_problem(world, start[0], start[1])
+        if problem:
+            raise ValueError(f"vehicle.start: {problem}")
+    elif start_places(world, start.circle.center, start.circle.radius_m, np.random.default_rng(0), 400).shape[0] == 0:
+        problem = start_problem(world, *start.circle.center)
+        raise ValueError(f"vehicle.start.circle: no place to stand in it; its centre {problem or 'is the only one'}")
+
+
+def start_places(world: WorldConfig, center: tuple[float, float], radius_m: float, rng: Any, tries: int) -> Array:
+    """(N, 2) random places of a circle, uniform over its area, where the vehicle can stand; at most `tries`."""
+    angle, radius = rng.uniform(0.0, 2.0 * math.pi, tries), radius_m * np.sqrt(rng.random(tries))
+    places = np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle)], axis=1)
+    return places[_can_stand(world, places)]
+
+
+def start_problem(world: WorldConfig, x: float, y: float) -> str | None:
+    """Why the vehicle cannot stand at (x, y), or None."""
+    hall, place = outline(world.footprint), shapely.Point(x, y)
+    if not hall.contains(place):
+        low, high = hall.bounds[:2], hall.bounds[2:]
+        return f"({x:g}, {y:g}) is outside the footprint, which spans {low} to {high}"
+    to_wall = hall.exterior.distance(place)
+    if to_wall < MIN_START_TO_WALL_M:
+        return f"({x:g}, {y:g}) is {to_wall:.2f} m from a wall; at least {MIN_START_TO_WALL_M} m are needed"
+    for obstacle in obstacles(world):
+        gap = obstacle.outline().distance(place)
+        if gap < MIN_START_TO_WALL_M:
+            return f"({x:g}, {y:g}) is {gap:.2f} m from {obstacle.name}; at least {MIN_START_TO_WALL_M} m are needed"
+    if not _can_stand(world, np.array([[x, y]]))[0]:
+        return f"({x:g}, {y:g}) is on a pile; the start must be on the bare floor, a vehicle's radius from any pile"
+    return None
+
+
+def _can_stand(world: WorldConfig, places: Array) -> NDArray[np.bool_]:
+    free = outline(world.footprint).buffer(-MIN_START_TO_WALL_M)
+    for obstacle in obstacles(world):
+        free = free.difference(obstacle.outline().buffer(MIN_START_TO_WALL_M))
+    good = np.asarray(shapely.contains_xy(free, places[:, 0], places[:, 1]))
+    for dx, dy in ((0.0, 0.0), (0.4, 0.0), (-0.4, 0.0), (0.0, 0.4), (0.0, -0.4)):
+        x, y = places[:, 0] + dx, places[:, 1] + dy
+        for pile in world.piles:
+            good &= piles.top_z(pile, x, y, lambda a, b: floor_z(world, a, b)) <= floor_z(world, x, y) + 0.02
+    return good

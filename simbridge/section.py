@@ -1,0 +1,20 @@
+"""What every section of a mission file has in common."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Ratio = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Point = tuple[Finite, Finite]
+Vector = tuple[Finite, Finite, Finite]
+
+
+class Section(BaseModel):
+    """A part of a mission file: unknown keys are refused, values cannot be changed after loading."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
