@@ -2,13 +2,15 @@
 
 The app on the vehicle, the lockstep runner and replay call the same methods; they differ only in who carries the bytes.
 A scan is processed in three steps, so that the heavy one can run off the event loop: `on_lidar_packet` hands out whole
-scans, `process_scan` registers one, `accept_scan` takes the result in.
+scans, `begin_scan` freezes what is known and gives the heavy step to run (one at a time, anywhere), `accept_scan` takes
+its result in. Every call that changes anything is told to `record` first, in order: replay makes the same calls again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 from companion import topics
 from companion.config import CompanionConfig
@@ -33,10 +35,15 @@ from companion.odometry import Odometry, ScanResult
 from companion.volume import estimate_volume
 
 Tap = Callable[[topics.Topic, int, object], None]
+Record = Callable[[str, int, bytes], None]  # kind: lidar, mavlink, operator, poll, begin, accept; time; payload
 
 
 def _no_tap(topic: topics.Topic, t_ns: int, message: object) -> None:
     """Nobody listens."""
+
+
+def _no_record(kind: str, t_ns: int, payload: bytes) -> None:
+    """Nothing is recorded."""
 
 
 @dataclass(slots=True)
@@ -62,6 +69,7 @@ class Flight:
     config: CompanionConfig
     lidar_metadata_json: str | None = None
     tap: Tap = _no_tap
+    record: Record = _no_record
     decoder: OusterDecoder = field(init=False)
     session: MavlinkSession = field(init=False)
     odometry: Odometry = field(init=False)
@@ -74,9 +82,10 @@ class Flight:
     keyframes: list[OdometryEstimate] = field(init=False, default_factory=list)
     events: list[Event] = field(init=False, default_factory=list)
     scans: int = field(init=False, default=0)
+    odometry_max_gap_s: float = field(init=False, default=0.0)
     _commands: list[OperatorCommand] = field(init=False, default_factory=list)
     _mapped_ns: int | None = field(init=False, default=None)
-    _t_scan_ns: int | None = field(init=False, default=None)
+    _sent_odometry_ns: int | None = field(init=False, default=None)
     _odometry_beat: _Beat = field(init=False)
     _setpoint_beat: _Beat = field(init=False)
 
@@ -97,10 +106,12 @@ class Flight:
     # ---- in ---------------------------------------------------------------------------------------------------------
 
     def on_lidar_packet(self, data: bytes, t_ns: int, source: tuple[str, int] | None = None) -> list[LidarScan]:
-        """Scans that this packet completed, in order: each goes to `process_scan`."""
+        """Scans that this packet completed, in order: each goes to `begin_scan`."""
+        self.record("lidar", t_ns, data)
         return self.decoder.receive(data, t_ns, source)
 
     def on_mavlink(self, data: bytes, t_ns: int, source: tuple[str, int] | None = None) -> None:
+        self.record("mavlink", t_ns, data)
         for message in self.session.receive(data, t_ns, source):
             if isinstance(message, AttitudeSample):
                 self.odometry.on_attitude(message)
@@ -114,20 +125,22 @@ class Flight:
                 self.on_operator(message)
 
     def on_operator(self, command: OperatorCommand) -> None:
+        self.record("operator", command.t_ns, f"{command.kind.value} {command.source}".encode())
         self._commands.append(command)
         self.tap(topics.OPERATOR, command.t_ns, command)
 
-    def process_scan(self, scan: LidarScan) -> ScanResult:
-        """Level, deskew and register one scan: the heavy step; may run in a thread, one scan at a time."""
-        return self.odometry.on_scan(scan)
+    def begin_scan(self, scan: LidarScan, t_ns: int) -> Callable[[], ScanResult]:
+        """The heavy step: level, deskew, register. May run in a thread; one scan at a time."""
+        self.record("begin", t_ns, b"")
+        return partial(self.odometry.on_scan, scan)
 
     def accept_scan(self, result: ScanResult, t_ns: int) -> bool:
         """Take a registered scan in. True if it belongs in the map: then `mapper.add` it, where it holds up nothing."""
+        self.record("accept", t_ns, b"")
         estimate = result.estimate
         self.scans += 1
         self.estimate = estimate
         self.walls = result.wall_ranges
-        self._t_scan_ns = estimate.t_scan_ns
         self.session.send_wall_ranges(result.wall_ranges)
         self.tap(topics.WALLS, t_ns, result.wall_ranges)
         if estimate.is_keyframe:
@@ -139,13 +152,14 @@ class Flight:
 
     def poll(self, t_ns: int) -> None:
         """Do what is due: estimates, setpoints, heartbeats. Call at `next_deadline_ns`, or more often."""
+        self.record("poll", t_ns, b"")
         self.session.poll(t_ns)
         if self._odometry_beat.due(t_ns):
             estimate = self.odometry.predict(t_ns)
             if estimate is not None:
                 self.estimate = estimate
                 if not self.guard.is_silent:
-                    self.session.send_odometry(estimate, t_ns)
+                    self._send_odometry(estimate, t_ns)
                 self.tap(topics.ESTIMATE, t_ns, estimate)
         if self._setpoint_beat.due(t_ns):
             self._navigate(t_ns)
@@ -168,6 +182,14 @@ class Flight:
         return estimate_volume(self.mapper.point_map(), self.config.volume)
 
     # ---- within -----------------------------------------------------------------------------------------------------
+
+    def _send_odometry(self, estimate: OdometryEstimate, t_ns: int) -> None:
+        if not self.session.send_odometry(estimate):
+            return
+        state = self.session.vehicle_state(t_ns)
+        if self._sent_odometry_ns is not None and state.is_armed:
+            self.odometry_max_gap_s = max(self.odometry_max_gap_s, (t_ns - self._sent_odometry_ns) * 1e-9)
+        self._sent_odometry_ns = t_ns
 
     def _navigate(self, t_ns: int) -> None:
         state: VehicleState = self.session.vehicle_state(t_ns)

@@ -109,7 +109,9 @@ def build_mission(
 def _cross_checks(companion: CompanionConfig, sim: SimConfig | None, teller: _Teller) -> Iterator[str]:
     nav, guard, lidar = companion.navigator, companion.guard, companion.lidar
     if lidar.min_range_m >= lidar.max_range_m:
-        yield teller.say(("lidar", "min_range_m"), lidar.min_range_m, f"must be below max_range_m {lidar.max_range_m:g}")
+        yield teller.say(
+            ("lidar", "min_range_m"), lidar.min_range_m, f"must be below max_range_m {lidar.max_range_m:g}"
+        )
     if lidar.elevation_min_deg >= lidar.elevation_max_deg:
         yield teller.say(
             ("lidar", "elevation_min_deg"), lidar.elevation_min_deg,
@@ -186,7 +188,9 @@ def _validate(
         for fault in error.errors():
             location = _real_location(tuple(fault["loc"]), raw)
             if fault["type"] == "extra_forbidden":
-                problems.append(teller.unknown(location, fault["input"], _allowed_keys(model, tuple(fault["loc"])[:-1])))
+                problems.append(
+                    teller.unknown(location, fault["input"], _allowed_keys(model, tuple(fault["loc"])[:-1]))
+                )
             else:
                 shown = None if fault["type"] == "missing" else fault["input"]
                 problems.append(teller.say(location, shown, _plain(fault["msg"])))

@@ -1,0 +1,120 @@
+"""The world on the wire, in real time: MAVLink over UDP, LiDAR packets over UDP. An edge: sockets and the wall clock."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from simbridge.loop import Simulation
+
+RECEIVE_BYTES = 2048
+BEHIND_LIMIT_S = 0.25  # farther behind than this, lost time is let go instead of caught up in a burst
+
+
+class MavlinkEndpoint(Protocol):
+    """The flight controller's side of its MAVLink links, by name ("offboard", "gcs")."""
+
+    def receive(self, link: str, data: bytes, t_ns: int) -> None: ...
+
+    def take_output(self) -> list[tuple[str, bytes]]: ...
+
+
+@dataclass(slots=True)
+class UdpLink:
+    """One link of the flight controller: sends to a listener, answers whoever spoke last, as PX4 does.
+
+    Raises: OSError: the local address is taken or not ours.
+    """
+
+    remote: tuple[str, int]
+    local: tuple[str, int] = ("127.0.0.1", 0)
+    unsent: int = 0
+    _socket: socket.socket = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.bind(self.local)
+
+    def send(self, data: bytes) -> None:
+        try:
+            self._socket.sendto(data, self.remote)
+        except OSError:  # nobody listens yet, or the buffer is full: a datagram lost, as on any network
+            self.unsent += 1
+
+    def receive(self) -> list[bytes]:
+        out = []
+        while True:
+            try:
+                data, source = self._socket.recvfrom(RECEIVE_BYTES)
+            except BlockingIOError:
+                return out
+            except OSError:  # an earlier datagram bounced
+                continue
+            self.remote = source
+            out.append(data)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@dataclass(slots=True)
+class Pace:
+    """Keeps simulated time at `speed` times wall time. speed 0: as fast as it goes."""
+
+    speed: float
+    _wall0_s: float | None = None
+    _sim0_ns: int = 0
+    late_s: float = 0.0
+
+    def wait(self, t_ns: int) -> None:
+        if self.speed <= 0:
+            return
+        now = time.monotonic()
+        if self._wall0_s is None:
+            self._wall0_s, self._sim0_ns = now, t_ns
+        target = self._wall0_s + (t_ns - self._sim0_ns) * 1e-9 / self.speed
+        if target > now:
+            time.sleep(target - now)
+        elif now - target > BEHIND_LIMIT_S:
+            self.late_s += now - target
+            self._wall0_s += now - target
+
+
+def serve(
+    simulation: Simulation,
+    autopilot: MavlinkEndpoint | None,
+    links: dict[str, UdpLink],
+    lidar: UdpLink,
+    *,
+    speed: float,
+    stop: Callable[[], bool],
+    each_second: Callable[[Simulation, Pace], None] | None = None,
+) -> Pace:
+    """Run the world until `stop()`; autopilot None: a real one, that has its own MAVLink sockets."""
+    pace = Pace(speed)
+    second = simulation.t_ns // 1_000_000_000
+    with contextlib.ExitStack() as closing:
+        for link in (*links.values(), lidar):
+            closing.callback(link.close)
+        while not stop():
+            if autopilot is not None:
+                for name, link in links.items():
+                    for data in link.receive():
+                        autopilot.receive(name, data, simulation.t_ns)
+            simulation.step()
+            for packet in simulation.take_lidar_packets():
+                lidar.send(packet)
+            if autopilot is not None:
+                for name, frame in autopilot.take_output():
+                    if name in links:
+                        links[name].send(frame)
+            if each_second is not None and simulation.t_ns // 1_000_000_000 != second:
+                second = simulation.t_ns // 1_000_000_000
+                each_second(simulation, pace)
+            pace.wait(simulation.t_ns)
+    return pace

@@ -1,0 +1,106 @@
+"""`stockpilot sim`: only the world, on the wire, in real time."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+import typer
+from rich.console import Console
+
+from companion.errors import ConfigError, LinkError
+from simbridge.loop import Simulation
+from simbridge.server import MavlinkEndpoint, Pace, UdpLink, serve
+from stockpilot.addresses import parse_address
+from stockpilot.mission import load_mission
+
+# Where PX4 itself binds: offboard and ground station links of instance 0.
+PX4_LOCAL_PORT = {"offboard": 14580, "gcs": 18570}
+
+
+def open_link(option: str, url: str, preferred_port: int = 0) -> UdpLink:
+    """A UDP link that sends to `url`; bound to the preferred local port where that is free. Raises: LinkError."""
+    _, host, port = parse_address(url, ("udpout", "udp"), option=option)
+    local = "127.0.0.1" if host.startswith("127.") or host == "localhost" else "0.0.0.0"
+    for candidate in dict.fromkeys((preferred_port, 0)):
+        try:
+            return UdpLink(remote=(host, port), local=(local, candidate))
+        except OSError as error:
+            fault = error
+    raise LinkError(f"{option} {url}: no local UDP port could be bound: {fault}")
+
+
+def sim_command(
+    path: Path, *, seed: int | None, settings: list[str], autopilot: str, binary: Path | None, offboard: str,
+    ground: str, lidar: str, speed: float, duration_s: float | None, metadata: Path | None, as_json: bool,
+) -> int:  # fmt: skip
+    """Exit code: 0 stopped as asked."""
+    mission = load_mission(path, settings, seed=seed)
+    if mission.sim is None:
+        raise ConfigError(f"{mission.path}: world: is missing: there is nothing to emulate")
+    console = Console(stderr=True)
+    stop = _Stop()
+    lidar_link = open_link("--lidar", lidar)
+    links: dict[str, UdpLink] = {}
+    endpoint: MavlinkEndpoint | None = None
+    if autopilot == "emulated":
+        from stockpilot.run import emulated
+
+        simulation, endpoint = emulated(mission.sim)
+        links = {
+            name: open_link(f"--{name}", url, PX4_LOCAL_PORT[name])
+            for name, url in (("offboard", offboard), ("gcs", ground))
+        }
+        close: Callable[[], object] = lambda: None  # noqa: E731
+    else:
+        from stockpilot.real_autopilot import simulation_for
+
+        simulation, closing = simulation_for(mission.sim, autopilot, binary, speed=speed)
+        close = closing.close
+    if metadata is not None:
+        metadata.write_text(simulation.lidar_metadata_json(), encoding="utf-8")
+    console.print(
+        f"[bold]{mission.name}[/] in real time x {speed:g}: MAVLink to {offboard} and {ground}, LiDAR to {lidar}; Ctrl-C stops"
+    )
+    began_ns = simulation.t_ns
+    last = {"wall": time.monotonic(), "late": 0.0}
+
+    def each_second(world: Simulation, pace: Pace) -> None:
+        if pace.late_s > last["late"] + 0.5:
+            last["late"] = pace.late_s
+            console.print(f"[yellow]this machine is too slow: {pace.late_s:.1f} s behind real time so far[/]")
+        if world.collision and not stop.told_collision:
+            stop.told_collision = True
+            console.print("[bold red]collision[/]")
+
+    def finished() -> bool:
+        return stop.asked or (duration_s is not None and simulation.t_ns - began_ns >= duration_s * 1e9)
+
+    try:
+        pace = serve(simulation, endpoint, links, lidar_link, speed=speed, stop=finished, each_second=each_second)
+    finally:
+        close()
+    summary = {
+        "mission": mission.name, "seed": mission.seed, "autopilot": autopilot,
+        "simulated_s": (simulation.t_ns - began_ns) * 1e-9, "late_s": pace.late_s,
+        "collision": simulation.collision, "min_clearance_m": simulation.min_clearance_m,
+    }  # fmt: skip
+    typer.echo(json.dumps(summary, indent=2) if as_json else "\n".join(f"{k:16} {v}" for k, v in summary.items()))
+    return 0
+
+
+class _Stop:
+    """SIGINT and SIGTERM end the world."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.told_collision = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._handle)
+
+    def _handle(self, _number: int, _frame: FrameType | None) -> None:
+        self.asked = True

@@ -1,0 +1,216 @@
+"""Many flights over a grid of mission keys, on Dask: resumable, one table, box plots, one page."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import yaml
+from pydantic import Field, ValidationError
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from companion.config import Section
+from companion.errors import ConfigError
+from stockpilot.mission import load_mission
+from stockpilot.results import write_json
+
+
+class SweepFile(Section):
+    """A sweep: missions x grid x seeds, each combination one closed-loop flight."""
+
+    name: str | None = None
+    description: str = ""
+    missions: list[str] = Field(min_length=1, description="mission files, relative to the sweep file")
+    set: dict[str, Any] = Field(default_factory=dict, description="mission keys set in every flight")
+    grid: dict[str, list[Any]] = Field(default_factory=dict, description="mission key: values to go through")
+    seeds: list[int] = Field(default=[0], min_length=1)
+    perfect_poses: bool = Field(False, description="also measure each volume with the true poses, for comparison")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepRun:
+    """One flight of a sweep, named by its parameters and seed."""
+
+    name: str
+    mission: str
+    settings: tuple[str, ...]
+    parameters: tuple[tuple[str, Any], ...]
+    seed: int
+    perfect_poses: bool
+
+
+def load_sweep(path: Path) -> tuple[SweepFile, list[SweepRun]]:
+    """The sweep and its runs, every mission validated before anything flies. Raises: ConfigError."""
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        sweep = SweepFile.model_validate(raw)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such sweep file") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is not YAML: {error}") from None
+    except ValidationError as error:
+        allowed = ", ".join(SweepFile.model_fields)
+        faults = (f"{path}: {'.'.join(map(str, e['loc'])) or '(file)'}: {e['msg']}; keys: {allowed}" for e in error.errors())
+        raise ConfigError("\n".join(faults)) from None
+    if not all(sweep.grid.values()):
+        raise ConfigError(f"{path}: grid: each key needs at least one value")
+    runs = list(_runs(path, sweep))
+    checked: set[tuple[str, tuple[str, ...]]] = set()
+    for run in runs:
+        if (run.mission, run.settings) not in checked:
+            checked.add((run.mission, run.settings))
+            load_mission(run.mission, run.settings, seed=run.seed)
+    return sweep, runs
+
+
+def _runs(path: Path, sweep: SweepFile) -> Iterator[SweepRun]:
+    fixed = tuple(f"{key}={json.dumps(value)}" for key, value in sweep.set.items())
+    for mission in sweep.missions:
+        mission_path = (path.parent / mission).resolve()
+        for values in itertools.product(*sweep.grid.values()):
+            parameters = tuple(zip(sweep.grid.keys(), values, strict=True))
+            varied = tuple(f"{key}={json.dumps(value)}" for key, value in parameters)
+            for seed in sweep.seeds:
+                shown = (Path(mission).stem, *(f"{key.split('.')[-1]}={_slug(value)}" for key, value in parameters))
+                identity = json.dumps([Path(mission).name, fixed, varied, seed, sweep.perfect_poses])
+                tag = hashlib.sha256(identity.encode()).hexdigest()[:8]
+                yield SweepRun(
+                    name="_".join((*shown, f"seed={seed}", tag)),
+                    mission=str(mission_path),
+                    settings=(*fixed, *varied),
+                    parameters=(("mission", Path(mission).stem), *parameters),
+                    seed=seed,
+                    perfect_poses=sweep.perfect_poses,
+                )
+
+
+def _slug(value: object) -> str:
+    return re.sub(r"[^A-Za-z0-9.+-]+", "-", json.dumps(value)).strip("-")[:40]
+
+
+def fly_run(run: SweepRun) -> dict[str, Any]:
+    """One flight, anywhere: its report, its parameters, its path in plan. Runs in a worker."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    from stockpilot.run import fly_lockstep
+
+    mission = load_mission(run.mission, run.settings, seed=run.seed)
+    flown = fly_lockstep(mission, with_perfect_poses=run.perfect_poses)
+    truth = flown.outcome.truth.position_world_m[::25]
+    return {
+        "run": run.name,
+        "parameters": dict(run.parameters),
+        "report": flown.scored.report,
+        "path_world_m": [[round(float(x), 3), round(float(y), 3)] for x, y in truth[:, :2]],
+        "outlines_world_m": [[[float(x), float(y)] for x, y in ring] for ring in flown.world.outlines()],
+    }
+
+
+def sweep_command(
+    sweep_file: Annotated[Path, typer.Argument(help="sweep file (YAML), e.g. missions/paper_sweep.yaml", show_default=False)],
+    out: Annotated[Path | None, typer.Option(help="folder for results; default runs/<sweep>")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="tcp://HOST:8786 of a Dask scheduler; default: this machine")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="processes on this machine; default: one a core")] = None,
+    docs: Annotated[Path | None, typer.Option(help="fill this document's block of the sweep, e.g. docs/results.md")] = None,
+    list_only: Annotated[bool, typer.Option("--list", help="name the flights, fly none")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON on stdout")] = False,
+) -> None:
+    """Fly a grid of missions, skip what is there already, and put all results in one table and one page.
+
+    A sweep that was stopped goes on where it was: start the same command again.
+    """
+    from stockpilot.sweep_report import fill_document, summarise, write_sweep_report
+
+    sweep, runs = load_sweep(sweep_file)
+    name = sweep.name or sweep_file.stem
+    folder = out or Path("runs") / name
+    if list_only:
+        for run in runs:
+            typer.echo(run.name)
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    done = read_results(folder, runs)
+    console = Console(stderr=True)
+    missing = [run for run in runs if run.name not in done]
+    if done:
+        console.print(f"{len(done)} of {len(runs)} flights are there already")
+    failed: dict[str, str] = {}
+    if missing:
+        for run, result in _fly_all(missing, scheduler, workers, console):
+            if isinstance(result, dict):
+                write_json(folder / f"{run.name}.json", result)
+                done[run.name] = result
+            else:
+                failed[run.name] = str(result)
+                console.print(f"[red]{run.name}: {result}[/]")
+    results = [done[run.name] for run in runs if run.name in done]
+    if not results:
+        raise ConfigError(f"{sweep_file}: no flight gave a result: {next(iter(failed.values()), 'nothing to fly')}")
+    page = write_sweep_report(folder, name, sweep.description, results)
+    summary = {**summarise(results), "failed": failed, "page": str(page), "table": str(folder / "results.parquet")}
+    if docs is not None:
+        fill_document(docs, name, results, command=f"stockpilot sweep {sweep_file}")
+    if as_json:
+        typer.echo(json.dumps(summary, indent=2))
+    else:
+        for key, value in summary.items():
+            typer.echo(f"{key:28} {value}")
+    if failed or len(results) < len(runs):
+        raise typer.Exit(1)
+
+
+def read_results(folder: Path, runs: Iterable[SweepRun]) -> dict[str, dict[str, Any]]:
+    """Results that are there and whole, by run name."""
+    out: dict[str, dict[str, Any]] = {}
+    for run in runs:
+        path = folder / f"{run.name}.json"
+        if path.exists():
+            try:
+                result = json.loads(path.read_text(encoding="utf-8"))
+            except (json.JSONDecodeError, UnicodeDecodeError):
+                print(f"{path}: not whole: flown again", file=sys.stderr)
+                continue
+            if isinstance(result, dict) and "report" in result:
+                out[run.name] = result
+    return out
+
+
+def _fly_all(
+    runs: Sequence[SweepRun], scheduler: str | None, workers: int | None, console: Console
+) -> Iterator[tuple[SweepRun, dict[str, Any] | Exception]]:
+    from dask.distributed import Client, LocalCluster, as_completed
+
+    columns = (
+        TextColumn("[progress.description]{task.description}"), BarColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    cluster = None
+    if scheduler is None:
+        count = min(workers or os.cpu_count() or 1, len(runs))
+        cluster = LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1",
+            memory_limit=0, silence_logs=40,
+        )  # fmt: skip
+    try:
+        with Client(cluster if cluster is not None else scheduler) as client, Progress(*columns, console=console) as bar:
+            task = bar.add_task("flights", total=len(runs))
+            futures = {client.submit(fly_run, run, key=run.name, pure=False, retries=2): run for run in runs}
+            for future in as_completed(list(futures)):
+                run = futures.pop(future)
+                error = future.exception()
+                yield run, (error if error is not None else future.result())
+                future.release()
+                bar.advance(task)
+    finally:
+        if cluster is not None:
+            cluster.close()
