@@ -1,0 +1,173 @@
+"""PointMap -> VolumeReport: walls, cells, floor, surface, sum, interval."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from companion.config import VolumeConfig
+from companion.messages import Array, PointMap, VolumeReport
+from companion.volume.floor import Floor, fit_floor
+from companion.volume.grid import Grid, Mask, cells_of, disc, grid_around
+from companion.volume.interval import Evidence, error_budget, interval
+from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells
+from companion.volume.walls import Footprint, find_footprint
+
+MIN_MAP_POINTS = 200
+INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
+
+
+def estimate_volume(point_map: PointMap, cfg: VolumeConfig) -> VolumeReport:
+    """Volume of the material above the floor and within the walls, with its interval.
+
+    Args:
+        point_map: in `map`, z up. A path is used when there is one (where it is free, how high was flown).
+        cfg: cell size and level of the interval.
+
+    Returns: the report. A poor map is told by `warnings` and a wide interval, never by an exception; a map that shows
+        no surface at all gives volume NaN and the interval (0, inf).
+    """
+    points = point_map.points_map
+    finite: Mask = np.asarray(np.isfinite(points).all(axis=1))
+    if not finite.all():
+        point_map = _only(point_map, finite)
+        points = point_map.points_map
+    if len(points) < MIN_MAP_POINTS:
+        return _nothing(cfg, f"the map has only {len(points)} points: no surface can be told")
+    grid = grid_around(points, cfg.cell_m)
+    key = grid.key(points)
+    footprint = find_footprint(point_map, grid, key)
+    strip = (footprint.depth_m < footprint.margin_m + 0.5 * grid.cell_m) | footprint.blocked
+    low = points[:, 2] < footprint.ceiling_m
+    wanted = (key >= 0) & low & ~strip.ravel()[np.maximum(key, 0)]
+    cells = robust_cells(points, np.where(wanted, key, -1), grid)
+    usable = cells.seen & (footprint.share > 0)
+    if usable.sum() < 20:
+        return _nothing(cfg, "the map shows no surface within the walls")
+    floor = fit_floor(grid, cells.x, cells.y, cells.z, cells.sigma_m, usable)
+    surface = build_surface(grid, cells, footprint.share > 0, strip, INTERPOLATION_REACH_M)
+    return _report(point_map, cfg, grid, footprint, cells, floor, surface)
+
+
+def _report(
+    point_map: PointMap,
+    cfg: VolumeConfig,
+    grid: Grid,
+    footprint: Footprint,
+    cells: Cells,
+    floor: Floor,
+    surface: Surface,
+) -> VolumeReport:
+    x, y = grid.centres()
+    floor_z = np.where(footprint.share > 0, floor.z(x, y), np.nan)
+    height = np.nan_to_num(surface.z_m - floor_z)
+    pile = pile_mask(height, footprint.share > 0, cells, grid)
+    area = grid.cell_area_m2 * footprint.share
+    volume = float(np.sum((height * area)[pile]))
+    position_sigma = max(point_map.position_sigma_m, footprint.pose_sigma_m)
+    evidence = Evidence(
+        grid=grid,
+        cells=cells,
+        surface=surface,
+        floor=floor,
+        height_m=height,
+        share=footprint.share,
+        pile=pile,
+        depth_m=footprint.depth_m,
+        has_walls=footprint.has_walls,
+        position_sigma_m=position_sigma,
+        height_sigma_m=max(point_map.height_sigma_m, keyframe_height_sigma(point_map, cells, floor)),
+        wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, 0.005)) if footprint.has_walls else 0.0,
+        obstacle_area_m2=footprint.obstacle_area_m2,
+    )
+    budget = error_budget(evidence)
+    total = float(area.sum())
+    ratio = {s: float(area[surface.state == s].sum()) / total for s in CellState}
+    return VolumeReport(
+        volume_m3=volume,
+        interval_m3=interval(volume, budget, cfg.interval_level),
+        interval_level=cfg.interval_level,
+        seen_ratio=ratio[CellState.SEEN],
+        interpolated_ratio=ratio[CellState.INTERPOLATED],
+        unseen_ratio=ratio[CellState.UNSEEN],
+        floor_area_m2=total,
+        pile_area_m2=float(area[pile].sum()),
+        x_m=grid.x_m,
+        y_m=grid.y_m,
+        surface_z_m=surface.z_m,
+        floor_z_m=floor_z,
+        cell_state=surface.state,
+        warnings=footprint.warnings,
+        footprint_m=footprint.polygon_m,
+        error_budget_m3=tuple(budget.items()),
+    )
+
+
+def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
+    """Where material lies, with a rim of floor all around it.
+
+    The rim (1 m) makes the choice free of bias: heights are summed with their sign, and a foot too thin to be told
+    from noise is within the rim.
+    """
+    size = 2 * cells_of(0.25, grid) + 1
+    known = inside.astype(np.float64)
+    smooth = ndimage.uniform_filter(height * known, size, mode="constant")
+    smooth /= np.maximum(ndimage.uniform_filter(known, size, mode="constant"), 1e-9)
+    noise = float(np.nanmedian(cells.sigma_m[cells.seen])) if cells.seen.any() else 0.05
+    core = (smooth > max(0.12, 4.0 * noise)) & inside
+    label, n = ndimage.label(core)
+    if n:
+        area = np.bincount(label.ravel()) * grid.cell_area_m2
+        area[0] = 0.0
+        core = area[label] >= 1.0
+    return np.asarray(ndimage.binary_dilation(core, disc(cells_of(1.0, grid))) & inside)
+
+
+def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> float:
+    """How far the keyframes disagree on the floor's height, 1 sigma, less what noise explains."""
+    on_floor = cells.of_point >= 0
+    on_floor[on_floor] = floor.cells.ravel()[cells.of_point[on_floor]]
+    index = np.flatnonzero(on_floor)
+    if len(index) < 100:
+        return 0.0
+    points = point_map.points_map[index]
+    r = points[:, 2] - floor.z(points[:, 0], points[:, 1])
+    _, of_keyframe = np.unique(point_map.keyframe_id[index], return_inverse=True)
+    n = np.bincount(of_keyframe)
+    seen = n >= 20
+    if seen.sum() < 3:
+        return 0.0
+    means = np.bincount(of_keyframe, r)[seen] / n[seen]
+    spread = (1.4826 * float(np.median(np.abs(means - np.median(means))))) ** 2
+    return float(np.sqrt(max(spread - float(np.mean(np.var(r) / n[seen])), 0.0)))
+
+
+def _only(point_map: PointMap, keep: Mask) -> PointMap:
+    return PointMap(
+        points_map=point_map.points_map[keep],
+        keyframe_id=point_map.keyframe_id[keep],
+        range_m=point_map.range_m[keep],
+        path_map=point_map.path_map,
+        position_sigma_m=point_map.position_sigma_m,
+        height_sigma_m=point_map.height_sigma_m,
+    )
+
+
+def _nothing(cfg: VolumeConfig, why: str) -> VolumeReport:
+    empty = np.zeros((0, 0))
+    return VolumeReport(
+        volume_m3=float("nan"),
+        interval_m3=(0.0, float("inf")),
+        interval_level=cfg.interval_level,
+        seen_ratio=0.0,
+        interpolated_ratio=0.0,
+        unseen_ratio=1.0,
+        floor_area_m2=0.0,
+        pile_area_m2=0.0,
+        x_m=np.zeros(0),
+        y_m=np.zeros(0),
+        surface_z_m=empty,
+        floor_z_m=empty,
+        cell_state=empty.astype(np.int8),
+        warnings=(why,),
+    )

@@ -1,0 +1,142 @@
+"""One honest floor: the lowest consistent plane, fitted to the cells that are floor and to no toe of the pile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from companion.messages import Array
+from companion.volume.grid import Grid, Index, Mask, cells_of, disc
+
+MAX_SLOPE = 0.12  # steeper than any floor that trucks drive on; loose material at rest is far steeper
+TRIALS = 500
+BLOCK_M = 3.0  # floors undulate over a few metres: residuals are judged in blocks of this size
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Floor:
+    """z = plane[0] + plane[1] (x - centre x) + plane[2] (y - centre y), map.
+
+    cells: which were taken as floor. covariance: (3, 3) of plane. undulation_m: 1 sigma of the floor about the plane
+    over blocks of BLOCK_M. residual_m: 1 sigma of single cells. found: False where no floor could be told.
+    """
+
+    plane: Array
+    centre_m: Array
+    covariance: Array
+    cells: Mask
+    undulation_m: float
+    residual_m: float
+    found: bool
+
+    def z(self, x: Array, y: Array) -> Array:
+        return np.asarray(
+            self.plane[0] + self.plane[1] * (x - self.centre_m[0]) + self.plane[2] * (y - self.centre_m[1])
+        )
+
+
+def fit_floor(grid: Grid, x: Array, y: Array, z: Array, sigma: Array, usable: Mask) -> Floor:
+    """Fit the floor. x, y, z, sigma: (ny, nx) cell centroids and the 1 sigma of z; usable: the cells to look at."""
+    index: Index = np.flatnonzero(usable).astype(np.int64)
+    centre = np.array([np.mean(x.ravel()[index]), np.mean(y.ravel()[index])]) if len(index) else np.zeros(2)
+    nothing = np.zeros(grid.shape, dtype=np.bool_)
+    if len(index) < 20:
+        return Floor(
+            plane=np.zeros(3),
+            centre_m=centre,
+            covariance=np.eye(3),
+            cells=nothing,
+            undulation_m=0.0,
+            residual_m=0.0,
+            found=False,
+        )
+    px, py, pz = (v.ravel()[index] for v in (x, y, z))
+    tolerance = float(np.clip(3.0 * np.median(sigma.ravel()[index]), 0.04, 0.25))
+    design = np.column_stack([np.ones(len(index)), px - centre[0], py - centre[1]])
+    plane = _lowest_plane(design, pz, tolerance)
+    cells = nothing
+    for _ in range(6):
+        cells = _floor_cells(grid, index, design, pz, plane, tolerance)
+        chosen = cells.ravel()[index]
+        if chosen.sum() < 10:
+            break
+        plane = np.linalg.lstsq(design[chosen], pz[chosen], rcond=None)[0]
+        spread = 1.4826 * float(np.median(np.abs(pz[chosen] - design[chosen] @ plane)))
+        tolerance = float(np.clip(3.5 * spread, 0.03, tolerance))
+    chosen = cells.ravel()[index]
+    return _judged(grid, plane, centre, design, pz, chosen, cells, index)
+
+
+def _lowest_plane(design: Array, z: Array, tolerance: float) -> Array:
+    """The plane with the most cells upon it and the fewest beneath it (a pile's flat top has many beneath)."""
+    rng = np.random.default_rng(0)
+    subset = rng.permutation(len(z))[:4000]
+    d, zs = design[subset], z[subset]
+    low = np.argsort(zs)[: max(len(zs) * 2 // 3, 10)]
+    best, best_score = np.array([float(np.quantile(zs, 0.1)), 0.0, 0.0]), -np.inf
+    extent = float(max(np.ptp(d[:, 1]), np.ptp(d[:, 2]), 1.0))
+    candidates = [best]
+    for _ in range(TRIALS):
+        pick = rng.choice(low, 3, replace=False)
+        three = d[pick]
+        if abs(np.linalg.det(three)) > 0.005 * extent**2:
+            candidates.append(np.linalg.solve(three, zs[pick]))
+    for plane in candidates:
+        if np.hypot(plane[1], plane[2]) > MAX_SLOPE:
+            continue
+        r = zs - d @ plane
+        score = float(np.sum(np.abs(r) < tolerance)) - 3.0 * float(np.sum(r < -tolerance))
+        if score > best_score:
+            best, best_score = plane, score
+    return best
+
+
+def _floor_cells(grid: Grid, index: Index, design: Array, z: Array, plane: Array, tolerance: float) -> Mask:
+    """Cells on the plane, away from everything that rises above it (so that no toe of the pile lifts the floor)."""
+    r = z - design @ plane
+    on = np.zeros(grid.shape, dtype=np.bool_)
+    above = np.zeros(grid.shape, dtype=np.float64)
+    known = np.zeros(grid.shape, dtype=np.float64)
+    on.ravel()[index] = np.abs(r) < tolerance
+    above.ravel()[index] = np.clip(r / tolerance, -1.5, 4.0)
+    known.ravel()[index] = 1.0
+    # Rising ground: the mean over a window is above, which single noisy cells are not.
+    size = 2 * cells_of(0.5, grid) + 1
+    share = ndimage.uniform_filter(known, size, mode="constant")
+    mean = ndimage.uniform_filter(above, size, mode="constant") / np.maximum(share, 1e-9)
+    rising = (mean > 0.6) & (share > 0.05)
+    near_rising = ndimage.binary_dilation(rising, disc(cells_of(0.75, grid)))
+    chosen = on & ~near_rising
+    return np.asarray(chosen if chosen.sum() >= 50 else on)
+
+
+def _judged(
+    grid: Grid, plane: Array, centre: Array, design: Array, z: Array, chosen: Mask, cells: Mask, index: Index
+) -> Floor:
+    r = (z - design @ plane)[chosen]
+    d = design[chosen]
+    residual = float(np.std(r)) if len(r) else 0.0
+    block = np.floor(d[:, 1:] / BLOCK_M).astype(np.int64)
+    _, of_block = np.unique(block, axis=0, return_inverse=True)
+    n = np.bincount(of_block) if len(r) else np.zeros(0)
+    full = n >= 6
+    covariance: Array = np.eye(3)
+    undulation = 0.1
+    if full.sum() >= 4:
+        means = (np.bincount(of_block, r) / n)[full]
+        undulation = float(np.sqrt(max(float(np.var(means)) - float(np.mean(residual**2 / n[full])), 0.0)))
+        rows = np.column_stack([np.bincount(of_block, d[:, i]) / n for i in range(3)])[full]
+        information = rows.T @ rows
+        per_block = float(np.var(means)) * len(means) / max(len(means) - 3, 1)
+        covariance = np.asarray(per_block * np.linalg.pinv(information), dtype=np.float64)
+    return Floor(
+        plane=plane,
+        centre_m=centre,
+        covariance=covariance,
+        cells=cells,
+        undulation_m=undulation,
+        residual_m=residual,
+        found=bool(full.sum() >= 4),
+    )

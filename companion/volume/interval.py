@@ -1,0 +1,140 @@
+"""What the volume's interval is made of: each part is a 1 sigma in m3, named, and they add in quadrature.
+
+The parts follow from the map itself wherever it can tell (spread of returns, disagreement of keyframes on walls and
+floor, undulation of the floor, cross-validation of the interpolation); constants below are the few it cannot tell.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from scipy import ndimage
+
+from companion.messages import Array
+from companion.volume.floor import BLOCK_M, Floor
+from companion.volume.grid import Grid, Mask
+from companion.volume.surface import Cells, CellState, Surface
+
+RANGE_BIAS_SIGMA_M = 0.002  # left of the sensor's range offset after its factory calibration; assumed, see docstring
+POSE_SIDES = 3.0  # over how many independent errors a lap's poses average, seen from one flank
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """All that the error budget looks at."""
+
+    grid: Grid
+    cells: Cells
+    surface: Surface
+    floor: Floor
+    height_m: Array
+    share: Array
+    pile: Mask
+    depth_m: Array
+    has_walls: bool
+    position_sigma_m: float
+    height_sigma_m: float
+    wall_sigma_m: float
+    obstacle_area_m2: float
+
+
+def error_budget(e: Evidence) -> dict[str, float]:
+    """1 sigma of each part, m3."""
+    area = e.grid.cell_area_m2 * e.share * e.pile
+    pile_area = float(area.sum())
+    flank_x, flank_y = _flanks(e, area)
+    flank = math.hypot(flank_x, flank_y)
+    gaps, hidden = _interpolation(e, area)
+    return {
+        "returns": _sampling(e, area),
+        "position": e.position_sigma_m * flank / math.sqrt(POSE_SIDES),
+        "height": e.height_sigma_m * pile_area / POSE_SIDES,
+        "range": RANGE_BIAS_SIGMA_M * (0.3 * pile_area + flank_x + flank_y),
+        "floor": _floor(e, area),
+        "walls": e.wall_sigma_m * _contact(e),
+        "interpolated": gaps,
+        "unseen": hidden,
+        "obstacles": _obstacles(e),
+    }
+
+
+def interval(volume_m3: float, budget: dict[str, float], level: float) -> tuple[float, float]:
+    """Two-sided interval; no volume is less than nothing."""
+    half = NormalDist().inv_cdf(0.5 + level / 2) * math.sqrt(sum(v * v for v in budget.values()))
+    return max(volume_m3 - half, min(volume_m3, 0.0)), volume_m3 + half
+
+
+def _sampling(e: Evidence, area: Array) -> float:
+    sigma = np.nan_to_num(e.cells.sigma_m)
+    return math.sqrt(float(np.sum((area * sigma) ** 2)))
+
+
+def _flanks(e: Evidence, area: Array) -> tuple[float, float]:
+    """Area of the pile's flanks as seen along x and along y: how much volume a metre of disagreement moves."""
+    gx, gy = np.abs(e.surface.slope_x) * area, np.abs(e.surface.slope_y) * area
+    return float(gx.sum()) / math.sqrt(2.0), float(gy.sum()) / math.sqrt(2.0)
+
+
+def _floor(e: Evidence, area: Array) -> float:
+    """The plane under the pile from the plane's covariance, and the undulation that the pile hides."""
+    x, y = e.grid.centres()
+    design = np.array([area.sum(), np.sum(area * (x - e.floor.centre_m[0])), np.sum(area * (y - e.floor.centre_m[1]))])
+    plane = float(design @ e.floor.covariance @ design)
+    hidden = e.floor.undulation_m**2 * float(area.sum()) * BLOCK_M**2
+    return math.sqrt(max(plane, 0.0) + hidden)
+
+
+def _contact(e: Evidence) -> float:
+    """Face of the pile against the walls, m2: what a metre of error in a wall's place would add."""
+    if not e.has_walls:
+        return 0.0
+    band = (np.abs(e.depth_m) < e.grid.cell_m) & (e.share > 0)
+    return float(np.sum(np.maximum(e.height_m, 0.0)[band & e.pile])) * e.grid.cell_m / 2.0
+
+
+def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:
+    """Gaps: the error grows with distance to the nearest seen cell, one error for each gap."""
+    state = e.surface.state
+    per_m = roughness(e)
+    out = []
+    for wanted in (CellState.INTERPOLATED, CellState.UNSEEN):
+        label, n = ndimage.label((state == wanted) & (e.share > 0))
+        if n == 0:
+            out.append(0.0)
+            continue
+        reach = per_m * np.minimum(e.surface.gap_m, 10.0)
+        if wanted == CellState.UNSEEN:
+            reach = np.maximum(3.0 * reach, 0.3 * np.minimum(e.surface.gap_m, 10.0))
+        # Outside the pile, too, something may lie where nothing was seen.
+        weight = e.grid.cell_area_m2 * e.share * np.where(e.pile, 1.0, 0.5 if wanted == CellState.UNSEEN else 0.1)
+        each = np.bincount(label.ravel(), (reach * weight).ravel(), minlength=n + 1)[1:]
+        out.append(math.sqrt(float(np.sum(each**2))))
+    return out[0], out[1]
+
+
+def roughness(e: Evidence) -> float:
+    """Error of linear interpolation per metre of distance, from cells left out: each against the mean of the seen
+    cells three to either side of it."""
+    z = np.where(e.cells.seen & e.pile, e.surface.z_m, np.nan)
+    errors = []
+    step = max(1, round(0.75 / e.grid.cell_m))
+    for axis in (0, 1):
+        a, b = np.roll(z, step, axis), np.roll(z, -step, axis)
+        d = z - 0.5 * (a + b)
+        errors.append(d[np.isfinite(d)])
+    all_errors = np.concatenate(errors)
+    if len(all_errors) < 20:
+        return 0.3
+    return max(float(np.sqrt(np.mean(all_errors**2))), 0.02) / (step * e.grid.cell_m)
+
+
+def _obstacles(e: Evidence) -> float:
+    """Half of what an obstacle's foot would hold at the pile's mean height, when one stands in the pile."""
+    inside = e.pile & (e.share < 1.0) & (e.depth_m > 2 * e.grid.cell_m)
+    if not inside.any():
+        return 0.0
+    cut = (1.0 - e.share[inside]) * e.grid.cell_area_m2 * np.maximum(e.height_m[inside], 0.0)
+    return 0.5 * float(cut.sum())
