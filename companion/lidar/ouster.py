@@ -57,7 +57,8 @@ _PIXELS = {
 
 
 def sensor_info(metadata: str | LidarConfig) -> core.SensorInfo:
-    """The sensor as its metadata JSON says, or one with the configured beams where no metadata is known.
+    """The sensor as its metadata JSON says, or one with the configured beams where no metadata is known: then every
+    beam leaves the rotation axis itself, which is up to 28 mm off for a real sensor (give its metadata).
 
     Raises: FileFormatError: not a metadata JSON of an Ouster sensor.
     """
@@ -75,6 +76,8 @@ def sensor_info(metadata: str | LidarConfig) -> core.SensorInfo:
     altitudes = np.linspace(metadata.elevation_max_deg, metadata.elevation_min_deg, metadata.rows)
     info.beam_altitude_angles = altitudes.tolist()
     info.beam_azimuth_angles = [0.0] * metadata.rows
+    info.beam_to_lidar_transform = np.eye(4)
+    info.lidar_origin_to_beam_origin_mm = 0.0
     return info
 
 

@@ -52,7 +52,7 @@ def _field_names(kind: Any) -> tuple[str, ...]:
 
 
 def _encode_fields(message: Any) -> dict[str, Any]:
-    return {name: _value(getattr(message, name)) for name in _field_names(type(message))}
+    return {name: _value(getattr(message, name)) for name in _field_names(message.__class__)}
 
 
 def _value(value: Any) -> Any:
