@@ -25,6 +25,7 @@ from companion.messages import (
     OperatorCommand,
     RangefinderSample,
     SetpointKind,
+    Severity,
     VehicleState,
     VolumeReport,
     WallRanges,
@@ -85,6 +86,7 @@ class Flight:
     odometry_max_gap_s: float = field(init=False, default=0.0)
     _commands: list[OperatorCommand] = field(init=False, default_factory=list)
     _mapped_ns: int | None = field(init=False, default=None)
+    _judged: OdometryEstimate | None = field(init=False, default=None)
     _sent_odometry_ns: int | None = field(init=False, default=None)
     _odometry_beat: _Beat = field(init=False)
     _setpoint_beat: _Beat = field(init=False)
@@ -129,16 +131,19 @@ class Flight:
         self._commands.append(command)
         self.tap(topics.OPERATOR, command.t_ns, command)
 
-    def begin_scan(self, scan: LidarScan, t_ns: int) -> Callable[[], ScanResult]:
-        """The heavy step: level, deskew, register. May run in a thread; one scan at a time."""
+    def begin_scan(self, scan: LidarScan, t_ns: int) -> Callable[[], ScanResult | None]:
+        """The heavy step: level, deskew, register. May run in a thread; one scan at a time. None: nothing to use."""
         self.record("begin", t_ns, b"")
         return partial(self.odometry.on_scan, scan)
 
-    def accept_scan(self, result: ScanResult, t_ns: int) -> bool:
+    def accept_scan(self, result: ScanResult | None, t_ns: int) -> bool:
         """Take a registered scan in. True if it belongs in the map: then `mapper.add` it, where it holds up nothing."""
         self.record("accept", t_ns, b"")
-        estimate = result.estimate
         self.scans += 1
+        if result is None:
+            return False
+        estimate = result.estimate
+        self._note_quality(estimate)
         self.estimate = estimate
         self.walls = result.wall_ranges
         self.session.send_wall_ranges(result.wall_ranges)
@@ -146,8 +151,6 @@ class Flight:
         if estimate.is_keyframe:
             self.keyframes.append(estimate)
             self.tap(topics.KEYFRAME, t_ns, estimate)
-        for event in result.events:
-            self._tell(event)
         return self._belongs_in_map(estimate)
 
     def poll(self, t_ns: int) -> None:
@@ -163,6 +166,11 @@ class Flight:
                 self.tap(topics.ESTIMATE, t_ns, estimate)
         if self._setpoint_beat.due(t_ns):
             self._navigate(t_ns)
+
+    def tell_failure(self, t_ns: int, task: str, error: Exception) -> None:
+        """A task of the outer ring failed: say so and go on."""
+        text = f"{task} failed and is started again: {type(error).__name__}: {error}"
+        self._tell(Event(t_ns=t_ns, severity=Severity.WARNING, name=f"{task}_failed", text=text))
 
     # ---- out --------------------------------------------------------------------------------------------------------
 
@@ -214,6 +222,32 @@ class Flight:
         if setpoint is not None and setpoint.kind is not SetpointKind.SILENT:
             self.session.send_setpoint(setpoint)
             self.tap(topics.SETPOINT, t_ns, setpoint)
+
+    def _note_quality(self, estimate: OdometryEstimate) -> None:
+        """Tell when odometry fails, comes back, jumps, or begins or ceases to be degenerate."""
+        before, t_ns = self._judged, estimate.t_scan_ns
+        self._judged = estimate
+        if before is None:
+            return
+        if (estimate.quality < 0) != (before.quality < 0):
+            failed = estimate.quality < 0
+            text = "Odometry lost: scans no longer fit the map" if failed else "Odometry is back"
+            severity = Severity.CRITICAL if failed else Severity.NOTICE
+            self._tell(
+                Event(t_ns=t_ns, severity=severity, name="odometry_lost" if failed else "odometry_back", text=text)
+            )
+        if estimate.reset_counter != before.reset_counter:
+            text = "Odometry found its place in the map again: the estimate jumps"
+            self._tell(Event(t_ns=t_ns, severity=Severity.WARNING, name="odometry_reset", text=text))
+        if estimate.is_degenerate != before.is_degenerate:
+            weak = estimate.is_degenerate
+            text = (
+                "Geometry is degenerate: position is weak along one axis"
+                if weak
+                else "Geometry holds in all axes again"
+            )
+            name = "degenerate" if weak else "no_longer_degenerate"
+            self._tell(Event(t_ns=t_ns, severity=Severity.WARNING if weak else Severity.INFO, name=name, text=text))
 
     def _belongs_in_map(self, estimate: OdometryEstimate) -> bool:
         if estimate.quality <= 0 or not estimate.converged:

@@ -12,7 +12,7 @@ import numpy as np
 
 from companion.flight import Flight
 from companion.geometry import yaw_from_quat
-from companion.messages import OdometryEstimate, OperatorCommand, OperatorCommandKind
+from companion.messages import LidarScan, OdometryEstimate, OperatorCommand, OperatorCommandKind
 from companion.odometry import ScanResult
 from simbridge.loop import Simulation
 from stockpilot.score import TruthLog
@@ -47,7 +47,7 @@ class Outcome:
     wall_time_s: float
     simulated_s: float
     estimates: list[OdometryEstimate]
-    keyframe_scans: list[ScanResult]
+    keyframe_scans: list[tuple[LidarScan, ScanResult]]
     mapped_scans: list[ScanResult]
     crossed_sha256: str
     odometry_max_gap_s: float
@@ -65,7 +65,7 @@ class Lockstep:
     on_output: Callable[[int, bytes], None] | None = None  # the recorder's: frames to the flight controller
     _digest: hashlib._Hash = field(init=False, default_factory=hashlib.sha256)
     _truth: list[tuple[int, float, float, float, float, bool]] = field(init=False, default_factory=list)
-    _keyframe_scans: list[ScanResult] = field(init=False, default_factory=list)
+    _keyframe_scans: list[tuple[LidarScan, ScanResult]] = field(init=False, default_factory=list)
     _mapped_scans: list[ScanResult] = field(init=False, default_factory=list)
     _estimates: list[OdometryEstimate] = field(init=False, default_factory=list)
     _took_off_ns: int | None = field(init=False, default=None)
@@ -89,7 +89,7 @@ class Lockstep:
         for packet in simulation.take_lidar_packets():
             self._digest.update(packet)
             for scan in flight.on_lidar_packet(packet, t_ns):
-                self._take_scan(flight.begin_scan(scan, t_ns)(), t_ns)
+                self._take_scan(scan, flight.begin_scan(scan, t_ns)(), t_ns)
         for frame in self.wire.take(simulation.t_ns):
             self._digest.update(frame)
             flight.on_mavlink(frame, t_ns)
@@ -129,14 +129,16 @@ class Lockstep:
             odometry_max_gap_s=self.flight.odometry_max_gap_s,
         )
 
-    def _take_scan(self, result: ScanResult, t_ns: int) -> None:
+    def _take_scan(self, scan: LidarScan, result: ScanResult | None, t_ns: int) -> None:
         belongs = self.flight.accept_scan(result, t_ns)
+        if result is None:
+            return
         if belongs:
             self.flight.mapper.add(result.levelled, result.estimate)
         if self.keep_scans:
             self._estimates.append(result.estimate)
             if result.estimate.is_keyframe:
-                self._keyframe_scans.append(result)
+                self._keyframe_scans.append((scan, result))
             if belongs:
                 self._mapped_scans.append(result)
 

@@ -25,6 +25,9 @@ from stockpilot.mission import Mission
 from stockpilot.score import MapPin, PoseScore, cramer_rao_bound_m, pin_map, score_poses, wall_distance_rms_m
 
 
+AT_HEIGHT_M = 0.5  # the paper's pipeline sees the scans this near to the mission's height
+
+
 @dataclass(slots=True)
 class Scored:
     """A flight with its scores, ready to be written and drawn."""
@@ -45,7 +48,7 @@ def score_flight(
     volume = estimate_volume(point_map, mission.companion.volume) if len(point_map.points_map) else None
     began_ns = outcome.estimates[0].t_scan_ns if outcome.estimates else int(outcome.truth.t_ns[0])
     pin = pin_map(outcome.truth, began_ns)
-    keyframes = [scan.estimate for scan in outcome.keyframe_scans]
+    keyframes = [result.estimate for _, result in outcome.keyframe_scans]
     ours = _score_estimates(outcome, pin, keyframes)
     outline = world.outlines()
     truth_volume = world.true_volume_m3
@@ -122,24 +125,34 @@ def _score_estimates(outcome: Outcome, pin: MapPin, estimates: list[OdometryEsti
 
 
 def _paper(mission: Mission, outcome: Outcome, pin: MapPin, truth_volume_m3: float) -> tuple[dict[str, Any], Array]:
-    """The paper's pipeline on the same keyframe scans."""
+    """The paper's pipeline on the same keyframe scans, from the first at the desired height on (section 2.2), pinned to
+    the true pose there. It takes z = h as given, so its position error is horizontal."""
     pipeline = PaperPipeline(mission.companion)
-    for scan in outcome.keyframe_scans:
-        pipeline.on_keyframe_scan(scan.levelled)
-    poses = pipeline.poses_map()  # (K, 3) x, y, yaw
-    if len(poses) == 0:
+    height_m = mission.companion.navigator.height_m
+    for scan, result in outcome.keyframe_scans:
+        if abs(result.estimate.position_map_m[2] - height_m) > AT_HEIGHT_M:
+            continue
+        if not pipeline.t_ns:
+            position, yaw = outcome.truth.pose_at(np.array([scan.t_ns]))
+            x, y, _ = pin.to_map(position)[0]
+            pipeline.on_keyframe_scan(scan, start_pose_map=(float(x), float(y), float(yaw[0]) - pin.yaw_rad))
+        else:
+            pipeline.on_keyframe_scan(scan)
+    if not pipeline.t_ns:
         return {"volume_m3": None, "e_v_percent": None, "e_p_m": None, "e_yaw_deg": None, "c_c": 0}, np.zeros((0, 2))
-    volume = paper_volume(pipeline.map_points())
+    poses = np.array(pipeline.poses, dtype=np.float64)
+    volume = paper_volume(pipeline.map_points)
     t_ns = np.array(pipeline.t_ns, dtype=np.int64)
     position, _ = outcome.truth.pose_at(t_ns)
-    height = pin.to_map(position)[:, 2:3]  # the paper takes z = h as given: its error is horizontal
-    score = score_poses(outcome.truth, pin, t_ns, np.column_stack([poses[:, :2], height]), poses[:, 2])
+    height = pin.to_map(position)[:, 2:3]
+    score = score_poses(outcome.truth, pin, t_ns, np.column_stack([poses[:, :2], height]), poses[:, 3])
     return {
         "volume_m3": volume,
         "e_v_percent": _error_percent(volume, truth_volume_m3),
         "e_p_m": score.e_p_m,
         "e_yaw_deg": score.e_yaw_deg,
         "c_c": pipeline.c_c,
+        "scans": len(pipeline.t_ns),
     }, poses[:, :2]
 
 

@@ -167,5 +167,3 @@ def _signals_abort(runner: Lockstep, console: Console) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-

@@ -1,0 +1,44 @@
+"""The structure holds by itself: sizes, generated documents, no test mode in flight code."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from stockpilot.dataflow import DOCUMENT, with_table
+
+ROOT = Path(__file__).resolve().parents[1]
+FLIGHT_CODE = sorted((ROOT / "companion").rglob("*.py"))
+ALL_CODE = [p for folder in ("companion", "simbridge", "stockpilot") for p in sorted((ROOT / folder).rglob("*.py"))]
+
+
+def test_app_reads_on_one_page() -> None:
+    assert len((ROOT / "companion" / "app.py").read_text(encoding="utf-8").splitlines()) <= 200
+
+
+@pytest.mark.parametrize("path", ALL_CODE, ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_file_outgrows_its_job(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 600
+
+
+@pytest.mark.parametrize("path", FLIGHT_CODE, ids=lambda p: str(p.relative_to(ROOT)))
+def test_flight_code_has_no_test_mode_and_reads_no_environment(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    attributes = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    suspicious = re.compile(r"^(is_)?(sim|simulated|simulation|testing|test_mode|replay_mode)$")
+    assert not [name for name in names | attributes if suspicious.match(name)]
+    assert "environ" not in attributes
+    assert "getenv" not in attributes
+
+
+def test_dataflow_table_is_generated_from_the_topics() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert with_table(text) == text, "docs/dataflow.md is stale: run `make docs`"
+
+
+def test_no_committed_lock_names_a_download_address() -> None:
+    assert "://" not in (ROOT / "requirements.lock").read_text(encoding="utf-8")
