@@ -36,14 +36,15 @@ from companion.odometry import Odometry, ScanResult
 from companion.volume import estimate_volume
 
 Tap = Callable[[topics.Topic, int, object], None]
-Record = Callable[[str, int, bytes], None]  # kind: lidar, mavlink, operator, poll, begin, accept; time; payload
+Source = tuple[str, int] | None
+Record = Callable[[str, int, bytes, Source], None]  # kind: lidar, mavlink, operator, poll, begin, accept
 
 
 def _no_tap(topic: topics.Topic, t_ns: int, message: object) -> None:
     """Nobody listens."""
 
 
-def _no_record(kind: str, t_ns: int, payload: bytes) -> None:
+def _no_record(kind: str, t_ns: int, payload: bytes, source: Source) -> None:
     """Nothing is recorded."""
 
 
@@ -107,13 +108,13 @@ class Flight:
 
     # ---- in ---------------------------------------------------------------------------------------------------------
 
-    def on_lidar_packet(self, data: bytes, t_ns: int, source: tuple[str, int] | None = None) -> list[LidarScan]:
+    def on_lidar_packet(self, data: bytes, t_ns: int, source: Source = None) -> list[LidarScan]:
         """Scans that this packet completed, in order: each goes to `begin_scan`."""
-        self.record("lidar", t_ns, data)
+        self.record("lidar", t_ns, data, source)
         return self.decoder.receive(data, t_ns, source)
 
-    def on_mavlink(self, data: bytes, t_ns: int, source: tuple[str, int] | None = None) -> None:
-        self.record("mavlink", t_ns, data)
+    def on_mavlink(self, data: bytes, t_ns: int, source: Source = None) -> None:
+        self.record("mavlink", t_ns, data, source)
         for message in self.session.receive(data, t_ns, source):
             if isinstance(message, AttitudeSample):
                 self.odometry.on_attitude(message)
@@ -127,18 +128,18 @@ class Flight:
                 self.on_operator(message)
 
     def on_operator(self, command: OperatorCommand) -> None:
-        self.record("operator", command.t_ns, f"{command.kind.value} {command.source}".encode())
+        self.record("operator", command.t_ns, f"{command.kind.value} {command.source}".encode(), None)
         self._commands.append(command)
         self.tap(topics.OPERATOR, command.t_ns, command)
 
     def begin_scan(self, scan: LidarScan, t_ns: int) -> Callable[[], ScanResult | None]:
         """The heavy step: level, deskew, register. May run in a thread; one scan at a time. None: nothing to use."""
-        self.record("begin", t_ns, b"")
+        self.record("begin", t_ns, b"", None)
         return partial(self.odometry.on_scan, scan)
 
     def accept_scan(self, result: ScanResult | None, t_ns: int) -> bool:
         """Take a registered scan in. True if it belongs in the map: then `mapper.add` it, where it holds up nothing."""
-        self.record("accept", t_ns, b"")
+        self.record("accept", t_ns, b"", None)
         self.scans += 1
         if result is None:
             return False
@@ -155,7 +156,7 @@ class Flight:
 
     def poll(self, t_ns: int) -> None:
         """Do what is due: estimates, setpoints, heartbeats. Call at `next_deadline_ns`, or more often."""
-        self.record("poll", t_ns, b"")
+        self.record("poll", t_ns, b"", None)
         self.session.poll(t_ns)
         if self._odometry_beat.due(t_ns):
             estimate = self.odometry.predict(t_ns)

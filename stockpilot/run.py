@@ -110,7 +110,7 @@ def run_command(
         if record:
             from stockpilot.recorded import LockstepRecorder
 
-            recorder = stack.enter_context(LockstepRecorder(folder, mission))
+            recorder = stack.enter_context(LockstepRecorder(folder, mission, autopilot))
 
         def attach(runner: Lockstep) -> None:
             if recorder is not None:

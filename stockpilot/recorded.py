@@ -1,0 +1,82 @@
+"""Hangs a recorder on a flight: everything that goes into the flight core and everything that comes out."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import yaml
+
+from companion.flight import Flight
+from companion.recording.log import Recorder
+from stockpilot.lockstep import Lockstep
+from stockpilot.mission import Mission
+
+GIB = 1 << 30
+
+
+def open_recorder(
+    folder: Path, mission: Mission, *, lidar_metadata_json: str | None, autopilot: str, threaded: bool
+) -> Recorder:
+    """A recorder for a flight of this mission. Raises: StockpilotError: the files cannot be created."""
+    config = mission.companion
+    attachments = {
+        "mission.yaml": yaml.safe_dump(mission.resolved(), sort_keys=False, allow_unicode=True).encode(),
+        "companion.json": config.model_dump_json(indent=2).encode(),
+    }
+    if lidar_metadata_json is not None:
+        attachments["lidar.json"] = lidar_metadata_json.encode()
+    metadata = {"mission": mission.name, "seed": str(mission.seed), "autopilot": autopilot, "commit": commit()}
+    return Recorder(
+        folder, metadata=metadata, attachments=attachments, reserve_bytes=round(config.recording.reserve_gib * GIB),
+        wall_offset_ns=time.time_ns() - time.monotonic_ns() if threaded else 0, threaded=threaded,
+    )  # fmt: skip
+
+
+def listen(recorder: Recorder, flight: Flight) -> None:
+    """From now on the recorder hears all that this flight hears and says."""
+    flight.record = recorder.input
+    flight.tap = recorder.tap
+
+
+def commit() -> str:
+    """The commit of this program, or "unknown" where it is not run from its repository."""
+    try:
+        out = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True,
+            timeout=5, check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return out.stdout.strip()
+
+
+class LockstepRecorder:
+    """Records a lockstep flight; a context manager, so that the files are whole however it ends."""
+
+    def __init__(self, folder: Path, mission: Mission, autopilot: str) -> None:
+        self._folder = folder
+        self._mission = mission
+        self._autopilot = autopilot
+        self._recorder: Recorder | None = None
+
+    def attach(self, runner: Lockstep) -> None:
+        self._recorder = open_recorder(
+            self._folder, self._mission, lidar_metadata_json=runner.flight.lidar_metadata_json,
+            autopilot=self._autopilot, threaded=False,
+        )  # fmt: skip
+        listen(self._recorder, runner.flight)
+        runner.on_output = self._recorder.output
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._recorder is not None:
+            outcome = {"state": "interrupted" if error is not None else "ended"}
+            self._recorder.close(outcome)
