@@ -61,7 +61,7 @@ class Obstacle:
 
 
 def outline(footprint: Footprint) -> Any:
-    """The hall's shapely polygon, corners counter-clockwise in the order of the file (edge i starts at corner i)."""
+    """The hall's shapely polygon."""
     return shapely.Polygon(corners(footprint))
 
 
@@ -73,6 +73,12 @@ def corners(footprint: Footprint) -> Array:
     angle = 2.0 * math.pi * np.arange(footprint.sides) / footprint.sides
     radius, center = footprint.circle.radius_m, np.asarray(footprint.circle.center)
     return np.asarray(center + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+def signed_area(points: Array) -> float:
+    """Of a polygon's corners; positive when they go counter-clockwise."""
+    x, y = points[:, 0], points[:, 1]
+    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2.0
 
 
 def largest_wall_distance_m(footprint: Footprint) -> float:

@@ -1,18 +1,33 @@
 """What the flight controller's sensors report: inertial unit, barometer, downward rangefinder.
 
-Axes are FRD (forward, right, down), as HIL_SENSOR wants them. Noise is seeded: each model is given its own Generator.
+Axes are FRD (forward, right, down), as HIL_SENSOR wants them. Noise is seeded: each model has its own stream.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simbridge.config import BarometerConfig, ImuConfig, RangefinderConfig
+from simbridge.rotation import matrix_from_rpy
+from simbridge.streams import Normals, stream
+
 Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.81
+STEP_NS = 4_000_000
+STEPS_PER_S = 250
+
+# White noise density of each axis: accelerometer (x, y, z) in g/sqrt(Hz), gyro in deg/s/sqrt(Hz).
+# ICM-42688-P: TDK DS-000347 tables 1 and 2. BMI088: Bosch BST-BMI088-DS001 tables 2 and 3.
+NOISE_DENSITY = {
+    "icm-42688-p": ((65e-6, 65e-6, 70e-6), 2.8e-3),
+    "bmi088": ((160e-6, 160e-6, 190e-6), 14e-3),
+    "ideal": ((0.0, 0.0, 0.0), 0.0),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +45,77 @@ class BaroSample:
     pressure_hpa: float
     pressure_altitude_m: float
     temperature_c: float
+
+
+class Imu:
+    """Bias, misalignment, white noise and vibration on the true mean of a step."""
+
+    def __init__(self, cfg: ImuConfig, seed: int) -> None:
+        accel_density, gyro_density = NOISE_DENSITY[cfg.part]
+        bandwidth = math.sqrt(STEPS_PER_S / 2.0)  # white noise averaged over a step
+        self._sigma = (
+            np.array([*(d * GRAVITY_MPS2 for d in accel_density), *(math.radians(gyro_density),) * 3]) * bandwidth
+        )
+        shake = (cfg.vibration_mps2,) * 3 + (math.radians(cfg.vibration_dps),) * 3
+        self._vibration = np.array(shake) if any(shake) else None
+        bias = stream(seed, "imu bias").standard_normal(6)
+        ideal = cfg.part == "ideal"
+        self._bias = bias * np.array(
+            [0.0 if ideal else cfg.accel_bias_mps2] * 3 + [0.0 if ideal else math.radians(cfg.gyro_bias_dps)] * 3
+        )
+        turn = matrix_from_rpy(np.radians(cfg.misalignment_rpy_deg)).T
+        self._turn = np.kron(np.eye(2), turn) if any(cfg.misalignment_rpy_deg) else None
+        self._normals = Normals(stream(seed, "imu"), 12)
+
+    def sample(self, truth: Array, thrust_ratio: float) -> ImuSample:
+        """truth: (6,) specific force and turn rate of the airframe, FRD. thrust_ratio: 0..1, for vibration."""
+        normals = self._normals.draw()
+        felt = truth if self._turn is None else self._turn @ truth
+        felt = felt + self._bias + self._sigma * normals[:6]
+        if self._vibration is not None:
+            felt = felt + thrust_ratio * self._vibration * normals[6:]
+        return ImuSample(accel_frd_mps2=felt[:3], gyro_frd_radps=felt[3:])
+
+
+class Barometer:
+    """ISA pressure at a site, with white noise and a slow wander."""
+
+    def __init__(self, cfg: BarometerConfig, seed: int) -> None:
+        self._cfg = cfg
+        self._period_ns = 1_000_000_000 // cfg.rate_hz
+        self._normals = Normals(stream(seed, "barometer"), 2)
+        self._keep = math.exp(-1.0 / (cfg.rate_hz * cfg.drift_time_s))
+        self._drift_hpa = 0.0
+
+    def sample(self, t_ns: int, z_m: float) -> BaroSample | None:
+        """None in steps without a measurement."""
+        if t_ns % self._period_ns >= STEP_NS:
+            return None
+        cfg, (white, slow) = self._cfg, self._normals.draw()
+        self._drift_hpa = self._keep * self._drift_hpa + math.sqrt(1.0 - self._keep**2) * cfg.drift_hpa * float(slow)
+        pressure = isa_pressure_hpa(cfg.site_altitude_m + z_m) + self._drift_hpa + cfg.noise_hpa * float(white)
+        return BaroSample(
+            pressure_hpa=pressure, pressure_altitude_m=isa_altitude_m(pressure), temperature_c=cfg.temperature_c
+        )
+
+
+class Rangefinder:
+    """Distance along the body's -z axis, its mount already taken off, so from the body's origin."""
+
+    def __init__(self, cfg: RangefinderConfig, seed: int) -> None:
+        self._cfg = cfg
+        self._period_ns = 1_000_000_000 // cfg.rate_hz
+        self._normals = Normals(stream(seed, "rangefinder"), 1)
+
+    def is_due(self, t_ns: int) -> bool:
+        return self._cfg.enabled and t_ns % self._period_ns < STEP_NS
+
+    def sample(self, true_m: float) -> float | None:
+        """true_m: negative where the ray meets nothing. None: nothing came back, or out of range."""
+        measured = true_m + self._cfg.noise_m * float(self._normals.draw()[0])
+        if true_m < 0.0 or not self._cfg.min_range_m <= measured <= self._cfg.max_range_m:
+            return None
+        return measured
 
 
 def isa_pressure_hpa(altitude_m: float) -> float:

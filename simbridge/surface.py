@@ -42,6 +42,12 @@ class Surface:
         corner = float(self.z[iy + 1, ix])
         return a + v * (corner - a) + u * (b - corner)
 
+    def bare_height(self, x: float, y: float) -> float:
+        """The floor alone at a place (it is a plane)."""
+        fx, fy = (x - self.x0) / self.cell_m, (y - self.y0) / self.cell_m
+        f = self.floor
+        return float(f[0, 0] + fx * (f[0, 1] - f[0, 0]) + fy * (f[1, 0] - f[0, 0]))
+
     def slope(self, x: float, y: float) -> tuple[float, float]:
         """Rise per metre along x and y of the triangle at a place."""
         ix, iy, u, v = self._cell(x, y)
@@ -169,10 +175,5 @@ def _displaced_integral(surface: Surface, shape: Any, top_z: float) -> float:
         return 0.0
     x, y = gx[inside], gy[inside]
     z = np.array([surface.height(px, py) for px, py in zip(x, y, strict=True)])
-    floor = np.array([_floor_at(surface, px, py) for px, py in zip(x, y, strict=True)])
+    floor = np.array([surface.bare_height(px, py) for px, py in zip(x, y, strict=True)])
     return float(np.mean(np.maximum(np.minimum(z, top_z) - floor, 0.0))) * float(shape.area)
-
-
-def _floor_at(surface: Surface, x: float, y: float) -> float:
-    bare = Surface(x0=surface.x0, y0=surface.y0, cell_m=surface.cell_m, z=surface.floor, floor=surface.floor)
-    return bare.height(x, y)

@@ -1,0 +1,186 @@
+"""The arithmetic of each step, compiled. Plain loops over small arrays; `warm_up` compiles all before time matters."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def _rotation(q: Array, out: Array) -> None:
+    """(3, 3) matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    out[0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    out[0, 1] = 2.0 * (x * y - w * z)
+    out[0, 2] = 2.0 * (x * z + w * y)
+    out[1, 0] = 2.0 * (x * y + w * z)
+    out[1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    out[1, 2] = 2.0 * (y * z - w * x)
+    out[2, 0] = 2.0 * (x * z - w * y)
+    out[2, 1] = 2.0 * (y * z + w * x)
+    out[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+
+
+def _rotors(
+    commands: Array,
+    states: Array,
+    sites: Array,
+    quat: Array,
+    velocity: Array,
+    wind: Array,
+    params: Array,
+    wrench: Array,
+) -> float:
+    """Rotor lag, thrust law, reaction torque and drag: writes force and torque (6,) in `world`; total thrust, N.
+
+    commands, states: (4,) 0..1; states are updated. sites: (4, 3) x, y (FLU) and torque per thrust about body z.
+    params: share of the step that the lag lets through, Tmax, curve c, drag. T = Tmax ((1 - c) u + c u^2).
+    """
+    through, max_thrust, curve, drag = params[0], params[1], params[2], params[3]
+    total = 0.0
+    tx = 0.0
+    ty = 0.0
+    tz = 0.0
+    for i in range(4):
+        command = min(max(commands[i], 0.0), 1.0)
+        states[i] += through * (command - states[i])
+        u = states[i]
+        thrust = max_thrust * ((1.0 - curve) * u + curve * u * u)
+        total += thrust
+        tx += sites[i, 1] * thrust
+        ty -= sites[i, 0] * thrust
+        tz += sites[i, 2] * thrust
+    r = np.empty((3, 3))
+    rotation(quat, r)
+    for k in range(3):
+        wrench[k] = r[k, 2] * total - drag * (velocity[k] - wind[k])
+        wrench[3 + k] = r[k, 0] * tx + r[k, 1] * ty + r[k, 2] * tz
+    return total
+
+
+def _inertial(q0: Array, q1: Array, v0: Array, v1: Array, step_s: float, gravity: float, out: Array) -> None:
+    """Means over a step, FRD, from the states at both ends: specific force into out[0:3], turn rate into out[3:6].
+
+    v: (6,) MuJoCo's free joint: velocity in `world`, turn rate in body (FLU).
+    """
+    q = q0 + q1 if q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3] >= 0.0 else q0 - q1
+    q = q / math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    r = np.empty((3, 3))
+    rotation(q, r)
+    ax = (v1[0] - v0[0]) / step_s
+    ay = (v1[1] - v0[1]) / step_s
+    az = (v1[2] - v0[2]) / step_s + gravity
+    for k in range(3):
+        sign = 1.0 if k == 0 else -1.0
+        out[k] = sign * (r[0, k] * ax + r[1, k] * ay + r[2, k] * az)
+        out[3 + k] = sign * 0.5 * (v0[3 + k] + v1[3 + k])
+
+
+def _aim(
+    directions: Array, dt: Array, quat: Array, rate: Array, velocity: Array, lever: Array, rays: Array, shifts: Array
+) -> None:
+    """World directions of some columns, each at its own time, and how far its origin is from the common one.
+
+    directions: (columns, rows, 3) in body. dt: (columns,) seconds from the common pose. rate: body. velocity: world.
+    lever: the beams' origin in body. rays: (columns * rows * 3,). shifts: (columns, 3).
+    """
+    r = np.empty((3, 3))
+    rotation(quat, r)
+    lx = rate[1] * lever[2] - rate[2] * lever[1]
+    ly = rate[2] * lever[0] - rate[0] * lever[2]
+    lz = rate[0] * lever[1] - rate[1] * lever[0]
+    n = 0
+    for c in range(directions.shape[0]):
+        t = dt[c]
+        for k in range(3):
+            shifts[c, k] = t * (velocity[k] + r[k, 0] * lx + r[k, 1] * ly + r[k, 2] * lz)
+        for i in range(directions.shape[1]):
+            x, y, z = directions[c, i, 0], directions[c, i, 1], directions[c, i, 2]
+            bx = x + t * (rate[1] * z - rate[2] * y)
+            by = y + t * (rate[2] * x - rate[0] * z)
+            bz = z + t * (rate[0] * y - rate[1] * x)
+            scale = 1.0 / math.sqrt(bx * bx + by * by + bz * bz)
+            for k in range(3):
+                rays[n] = scale * (r[k, 0] * bx + r[k, 1] * by + r[k, 2] * bz)
+                n += 1
+
+
+def _returns(
+    distance: Array,
+    normals: Array,
+    rays: Array,
+    shifts: Array,
+    noise: Array,
+    chance: Array,
+    params: Array,
+    row_index: NDArray[np.int64],
+    first: int,
+    range_mm: NDArray[np.uint32],
+    signal: NDArray[np.uint16],
+) -> None:
+    """What the sensor makes of the rays of some columns: writes into range_mm, signal (rows, packet columns).
+
+    distance: from the common origin, negative where nothing was hit. noise: (columns, rows) standard normal.
+    chance: (columns, rows, 3) uniform, for dust, its place, and loss. params: see `lidar.py`.
+    """
+    sigma, low, high = params[0], params[1], params[2]
+    grazing_cos, dropout, dust_per_m, lost, bias = params[3], params[4], params[5], params[6], params[7]
+    rows = row_index.shape[0]
+    for c in range(shifts.shape[0]):
+        for i in range(rows):
+            n = c * rows + i
+            m = 3 * n
+            row = row_index[i]
+            range_mm[row, first + c] = 0
+            signal[row, first + c] = 0
+            r = distance[n]
+            if r < 0.0:
+                continue
+            facing = rays[m] * normals[m] + rays[m + 1] * normals[m + 1] + rays[m + 2] * normals[m + 2]
+            cosine = abs(facing)
+            if cosine > 0.02:  # seen from its own origin: exact for a plane
+                r -= (
+                    shifts[c, 0] * normals[m] + shifts[c, 1] * normals[m + 1] + shifts[c, 2] * normals[m + 2]
+                ) / facing
+            strength = 4000.0 * cosine
+            loss = dropout
+            if cosine < grazing_cos:
+                loss = max(loss, 1.0 - (cosine / grazing_cos) ** 2)
+            if dust_per_m > 0.0:
+                clear = math.exp(-dust_per_m * r)
+                strength *= clear * clear
+                if chance[c, i, 0] > clear:  # caught on the way: at a place as Beer and Lambert have it
+                    if (chance[c, i, 0] - clear) / (1.0 - clear) < lost:
+                        continue
+                    r = -math.log(1.0 - chance[c, i, 1] * (1.0 - clear)) / dust_per_m
+                    strength = 200.0
+            if chance[c, i, 2] < loss:
+                continue
+            r += sigma * noise[c, i] + bias
+            if r < low or r > high:
+                continue
+            range_mm[row, first + c] = np.uint32(r * 1000.0 + 0.5)
+            signal[row, first + c] = np.uint16(min(strength / max(0.04 * r * r, 0.25), 65535.0))
+
+
+rotation = njit(cache=True)(_rotation)
+rotors = njit(cache=True)(_rotors)
+inertial = njit(cache=True)(_inertial)
+aim = njit(cache=True)(_aim)
+returns = njit(cache=True)(_returns)
+
+
+def warm_up() -> None:
+    """Compile (or load from the cache) every kernel for the types that the loop gives."""
+    q, v, z3 = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(3)
+    rotors(np.zeros(4), np.zeros(4), np.zeros((4, 3)), q, v, z3, np.zeros(4), np.zeros(6))
+    inertial(q, q, v, v, 0.004, 9.81, np.zeros(6))
+    aim(np.ones((1, 1, 3)), np.zeros(1), q, z3, z3, z3, np.zeros(3), np.zeros((1, 3)))
+    returns(
+        np.ones(1), np.ones(3), np.ones(3), np.zeros((1, 3)), np.zeros((1, 1)), np.zeros((1, 1, 3)), np.zeros(8),
+        np.zeros(1, dtype=np.int64), 0, np.zeros((1, 16), dtype=np.uint32), np.zeros((1, 16), dtype=np.uint16),
+    )  # fmt: skip

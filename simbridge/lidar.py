@@ -1,0 +1,144 @@
+"""The rotating LiDAR: casts each column at the moment it belongs to, returns the device's own packets."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from simbridge.config import LidarSimConfig
+from simbridge.kernels import aim, returns
+from simbridge.model import RAY_GROUPS
+from simbridge.ouster import COLUMNS_PER_PACKET, SENSOR_ABOVE_BASE_M, PacketWriter, directions_sensor, sensor_info
+from simbridge.rotation import matrix_from_rpy
+from simbridge.sensors import STEPS_PER_S
+from simbridge.streams import stream
+
+Array = NDArray[np.float64]
+
+NS = 1_000_000_000
+BIAS = 7  # place in the kernel's parameters
+CUTOFF_M = 1000.0
+
+
+class Lidar:
+    """Call `cast` once each step; packets come out as their last column is done."""
+
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, body_id: int, cfg: LidarSimConfig, seed: int, began_ns: int
+    ) -> None:
+        """body_id: the carrier, which rays pass through. began_ns: simulated time of the first column."""
+        self._model, self._data, self._body_id = model, data, body_id
+        self._columns, self._per_s = cfg.columns, cfg.columns * cfg.rate_hz
+        self._began_ns, self._clock_offset_ns = began_ns, round(cfg.clock_offset_s * NS)
+        self.metadata_json: str = sensor_info(cfg).to_json_string()
+        self._writer = PacketWriter(cfg)
+        self._rows = np.array([row for row in range(cfg.rows) if row not in cfg.rows_off], dtype=np.int64)
+        turn, self._lever = _true_mount(cfg)
+        directions = directions_sensor(cfg)[:, self._rows] @ turn.T
+        self._directions = np.ascontiguousarray(np.concatenate([directions, directions]))  # so that no slice wraps
+        self._noise_rng, self._chance_rng = stream(seed, "lidar noise"), stream(seed, "lidar chance")
+        self._loss_rng, self._loss_ratio = stream(seed, "lidar packets"), cfg.packet_loss_ratio
+        self._noise = np.zeros((cfg.columns, len(self._rows)))
+        self._chance = np.zeros((cfg.columns, len(self._rows), 3))
+        self._params = _parameters(cfg)
+        most = self._per_s // STEPS_PER_S + 2
+        self._shifts = np.zeros((most, 3))
+        self._rays, self._normals = np.zeros(3 * most * len(self._rows)), np.zeros(3 * most * len(self._rows))
+        self._distance = np.zeros(most * len(self._rows))
+        self._geom = np.zeros(most * len(self._rows), dtype=np.int32)
+        self._next = 0  # column, counted from the first one
+
+    @property
+    def range_bias_m(self) -> float:
+        """Added to every range: a fault."""
+        return float(self._params[BIAS])
+
+    @range_bias_m.setter
+    def range_bias_m(self, bias_m: float) -> None:
+        self._params[BIAS] = bias_m
+
+    def cast(
+        self, t_pose_ns: int, t_end_ns: int, position: Array, quat: Array, velocity: Array, rate: Array
+    ) -> list[bytes]:
+        """Measure the columns up to t_end and give the packets that are done.
+
+        position, quat (wxyz), velocity in `world`, rate in body (FLU): the motion at t_pose, near the columns' times.
+        """
+        first, end = self._next, (t_end_ns - self._began_ns) * self._per_s // NS + 1
+        if end <= first:
+            return []
+        self._next = end
+        self._shoot(first, end - first, t_pose_ns, position, quat, velocity, rate)
+        packets = []
+        column = first
+        while column < end:
+            into = column % COLUMNS_PER_PACKET
+            count = min(end - column, COLUMNS_PER_PACKET - into)
+            self._receive(column, count, column - first, into)
+            column += count
+            if into + count == COLUMNS_PER_PACKET:
+                packets.append(self._pack(column - COLUMNS_PER_PACKET))
+        if self._loss_ratio > 0.0:
+            packets = [packet for packet in packets if self._loss_rng.random() >= self._loss_ratio]
+        return packets
+
+    def _t_ns(self, column: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Simulated time of a column."""
+        return self._began_ns + column * NS // self._per_s
+
+    def _shoot(
+        self, first: int, count: int, t_pose_ns: int, position: Array, quat: Array, velocity: Array, rate: Array
+    ) -> None:
+        """One mj_multiRay for the columns of a step, all from the pose's origin, each in its own direction."""
+        dt = np.multiply(self._t_ns(np.arange(first, first + count)) - t_pose_ns, 1e-9, dtype=np.float64)
+        start = first % self._columns
+        aim(self._directions[start : start + count], dt, quat, rate, velocity, self._lever, self._rays, self._shifts)
+        origin = np.empty(3)
+        mujoco.mju_rotVecQuat(origin, self._lever, quat)
+        origin += position
+        n = count * len(self._rows)
+        mujoco.mj_multiRay(
+            self._model, self._data, origin, self._rays[: 3 * n], RAY_GROUPS, 1, self._body_id,
+            self._geom[:n], self._distance[:n], self._normals[: 3 * n], n, CUTOFF_M,
+        )  # fmt: skip
+
+    def _receive(self, column: int, count: int, offset: int, into: int) -> None:
+        """Noise and losses on `count` columns of this step's rays, into the packet that is being filled."""
+        start = column % self._columns
+        if start == 0:
+            self._noise_rng.standard_normal(out=self._noise)
+            self._chance_rng.random(out=self._chance)
+        a, b = offset * len(self._rows), (offset + count) * len(self._rows)
+        returns(
+            self._distance[a:b], self._normals[3 * a : 3 * b], self._rays[3 * a : 3 * b],
+            self._shifts[offset : offset + count], self._noise[start : start + count],
+            self._chance[start : start + count], self._params, self._rows, into,
+            self._writer.range_mm, self._writer.signal,
+        )  # fmt: skip
+
+    def _pack(self, column: int) -> bytes:
+        t_ns = self._t_ns(np.arange(column, column + COLUMNS_PER_PACKET)) + self._clock_offset_ns
+        turn, first = divmod(column, self._columns)
+        return self._writer.pack(turn, first, t_ns)
+
+
+def _parameters(cfg: LidarSimConfig) -> Array:
+    """In the order that the kernel `returns` reads; BIAS is the last."""
+    dust_per_m = 1.0 / cfg.dust.visibility_m if cfg.dust.visibility_m is not None else 0.0
+    return np.array(
+        [
+            cfg.noise_m, cfg.min_range_m, cfg.max_range_m, math.cos(math.radians(cfg.grazing_deg)),
+            cfg.dropout_ratio, dust_per_m, cfg.dust.lost_ratio, 0.0,
+        ]
+    )  # fmt: skip
+
+
+def _true_mount(cfg: LidarSimConfig) -> tuple[Array, Array]:
+    """Rotation (3, 3) sensor to body, and the beams' origin in body, both with the mount's error."""
+    rpy = np.radians(np.array(cfg.mount_rpy_deg) + np.array(cfg.mount_error_rpy_deg))
+    turn = matrix_from_rpy(rpy)
+    position = np.array(cfg.mount_position_m) + np.array(cfg.mount_error_position_m)
+    return turn, np.asarray(position + turn @ np.array([0.0, 0.0, SENSOR_ABOVE_BASE_M]))

@@ -1,0 +1,144 @@
+"""The emulated side, step by step: 4 ms of sensors, flight controller, motion and LiDAR at a time.
+
+Simulated time counts from boot. Pacing (lockstep or real time) is the caller's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from simbridge import footprint as fp
+from simbridge import kernels
+from simbridge.config import SimConfig, StartCircle
+from simbridge.lidar import Lidar
+from simbridge.model import RAY_GROUPS
+from simbridge.sensors import STEP_NS, Barometer, BaroSample, Imu, ImuSample, Rangefinder
+from simbridge.streams import stream
+from simbridge.vehicle import Vehicle
+from simbridge.world import World, build_world
+
+Array = NDArray[np.float64]
+
+BOOT_NS = 1_000_000_000
+CLEARANCE_PERIOD_NS = 40_000_000
+HARD_LANDING_MPS = 1.5  # PX4 lands at 0.7
+TOPPLED_COS = math.cos(math.radians(50.0))
+
+
+class Controller(Protocol):
+    """A flight controller, emulated or real."""
+
+    def step(self, t_ns: int, imu: ImuSample, baro: BaroSample | None, rangefinder_m: float | None) -> Array:
+        """Motor commands (4,), 0..1, for the next 4 ms."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """Where the vehicle really is. For scoring: it may reach nothing that flies. rate_body_radps: FLU."""
+
+    t_ns: int
+    position_world_m: Array
+    q_world_body_wxyz: Array
+    velocity_world_mps: Array
+    rate_body_radps: Array
+
+
+class Simulation:
+    """One store, one vehicle, one seed: the same each time, to the last bit."""
+
+    def __init__(self, cfg: SimConfig, autopilot: Controller) -> None:
+        kernels.warm_up()
+        self.world: World = build_world(cfg.world, cfg.vehicle)
+        self.start: tuple[float, float, float] = start_pose(cfg)
+        self.t_ns = BOOT_NS
+        self.collision = False
+        self.min_clearance_m = math.inf
+        self._autopilot = autopilot
+        self._vehicle = Vehicle(self.world.model, self.world.surface, cfg.vehicle, cfg.world.wind, self.start, cfg.seed)
+        self._imu = Imu(cfg.vehicle.imu, cfg.seed)
+        self._barometer = Barometer(cfg.vehicle.barometer, cfg.seed)
+        self._rangefinder = Rangefinder(cfg.vehicle.rangefinder, cfg.seed)
+        v = self._vehicle
+        self._lidar = Lidar(self.world.model, v.data, v.body_id, cfg.lidar, cfg.seed, BOOT_NS)
+        self._packets: list[bytes] = []
+
+    def step(self) -> None:
+        """4 ms: what the sensors measured goes to the flight controller, its motor commands move the vehicle."""
+        t_ns, vehicle = self.t_ns, self._vehicle
+        imu = self._imu.sample(vehicle.inertial_frd, vehicle.thrust_ratio)
+        baro = self._barometer.sample(t_ns, float(vehicle.position[2]))
+        rangefinder_m = None
+        if self._rangefinder.is_due(t_ns):
+            rangefinder_m = self._rangefinder.sample(self._distance_down())
+        controls = self._autopilot.step(t_ns, imu, baro, rangefinder_m)
+        position, quat, velocity = vehicle.position.copy(), vehicle.q_world_body_wxyz.copy(), vehicle.motion[:3].copy()
+        vehicle.step(controls)
+        self.t_ns = t_ns + STEP_NS
+        self._turn_lidar(position, quat)
+        self._watch(velocity)
+
+    def take_lidar_packets(self) -> list[bytes]:
+        """Packets sent since the last call, in order."""
+        packets, self._packets = self._packets, []
+        return packets
+
+    def lidar_metadata_json(self) -> str:
+        """What the sensor's HTTP interface would say of it: ouster-sdk's SensorInfo."""
+        return self._lidar.metadata_json
+
+    def truth(self) -> Truth:
+        v = self._vehicle
+        return Truth(
+            t_ns=self.t_ns,
+            position_world_m=v.position.copy(),
+            q_world_body_wxyz=v.q_world_body_wxyz.copy(),
+            velocity_world_mps=v.motion[:3].copy(),
+            rate_body_radps=v.motion[3:].copy(),
+        )
+
+    def _distance_down(self) -> float:
+        down = np.empty(3)
+        mujoco.mju_rotVecQuat(down, np.array([0.0, 0.0, -1.0]), self._vehicle.q_world_body_wxyz)
+        v = self._vehicle
+        return float(mujoco.mj_ray(self.world.model, v.data, v.position, down, RAY_GROUPS, 1, v.body_id, None, None))
+
+    def _turn_lidar(self, position_before: Array, quat_before: Array) -> None:
+        """Columns of the step just flown, from the pose in its middle."""
+        v = self._vehicle
+        middle = 0.5 * (position_before + v.position)
+        quat = quat_before + v.q_world_body_wxyz  # neighbours in time: never near opposite signs
+        quat /= math.sqrt(float(quat @ quat))
+        t_ns = self.t_ns
+        self._packets += self._lidar.cast(t_ns - STEP_NS // 2, t_ns, middle, quat, v.motion[:3], v.motion[3:])
+
+    def _watch(self, velocity_before: Array) -> None:
+        """Collision and clearance."""
+        vehicle = self._vehicle
+        if self.t_ns % CLEARANCE_PERIOD_NS < STEP_NS:
+            clearance = self.world.clearance(vehicle.position) - fp.VEHICLE_RADIUS_M
+            self.min_clearance_m = min(self.min_clearance_m, clearance)
+        if self.collision or not vehicle.has_contact:
+            return
+        if vehicle.touches_store:
+            self.collision = True
+        elif float(velocity_before[2]) < -HARD_LANDING_MPS or vehicle.up_cos < TOPPLED_COS:
+            self.collision = True  # on the ground, but not as one lands
+
+
+def start_pose(cfg: SimConfig) -> tuple[float, float, float]:
+    """x, y, yaw (rad) in `world`; of a circle: drawn by the seed among the places where the vehicle can stand."""
+    start = cfg.vehicle.start
+    if not isinstance(start, StartCircle):
+        return start[0], start[1], math.radians(start[2]) if len(start) == 3 else 0.0
+    rng = stream(cfg.seed, "start")
+    places = fp.start_places(cfg.world, start.circle.center, start.circle.radius_m, rng, 400)
+    if len(places) == 0:
+        raise ValueError(f"vehicle.start.circle: no place to stand found in it with seed {cfg.seed}")
+    yaw = rng.uniform(-math.pi, math.pi) if start.yaw_deg is None else math.radians(start.yaw_deg)
+    return float(places[0, 0]), float(places[0, 1]), yaw

@@ -1,0 +1,136 @@
+"""The quadrotor: motor commands in, true motion out.
+
+Motor order (PX4 quad X and ArduPilot FRAME_TYPE 1 alike): 0 front right CCW, 1 rear left CCW, 2 front left CW, 3 rear
+right CW. A CCW rotor turns the nose right: +reaction about FRD z, so -reaction about body z (up).
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from simbridge.config import VehicleConfig, Wind
+from simbridge.kernels import inertial, rotors
+from simbridge.model import FOOT_Z_M, STEP_S, tilt_wxyz
+from simbridge.sensors import GRAVITY_MPS2
+from simbridge.streams import Normals, stream
+from simbridge.surface import Surface
+
+Array = NDArray[np.float64]
+
+GROUND_NEAR_M = 2.0  # the ground plane follows the vehicle only this near to the surface
+SETTLE_STEPS = 250
+
+
+class Vehicle:
+    """State lives in MuJoCo's data; position, quaternion and velocity are views of it, changing with each step.
+
+    inertial_frd: (6,) true mean specific force and turn rate of the last step. thrust_ratio: of its full thrust.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        surface: Surface,
+        cfg: VehicleConfig,
+        wind: Wind,
+        start: tuple[float, float, float],
+        seed: int,
+    ) -> None:
+        """start: x, y, yaw (rad) in `world`; the vehicle is set on the ground there and left to settle."""
+        self.data = mujoco.MjData(model)
+        self.body_id = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "vehicle"))
+        self._model, self._surface, self._cfg = model, surface, cfg
+        self._ground_geom = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground"))
+        self.position: Array = self.data.qpos[0:3]
+        self.q_world_body_wxyz: Array = self.data.qpos[3:7]
+        self.motion: Array = self.data.qvel  # velocity in world, turn rate in body
+        self._wrench: Array = self.data.xfrc_applied[self.body_id]
+        self._ground_pos, self._ground_quat = self.data.mocap_pos[0], self.data.mocap_quat[0]
+        r, a = cfg.reaction_torque_m, cfg.arm_m
+        self._sites = np.array([[a, -a, -r], [-a, a, -r], [a, a, r], [-a, -a, r]])
+        through = 1.0 - math.exp(-STEP_S / cfg.substeps / cfg.rotor_lag_s)
+        self._params = np.array([through, cfg.max_thrust_n, cfg.thrust_curve, cfg.drag_nspm])
+        self._rotors = np.zeros(4)
+        self._draught = Draught(wind, seed)
+        self.inertial_frd = np.zeros(6)
+        self.thrust_ratio = 0.0
+        self._place(start)
+
+    def step(self, controls: Array) -> None:
+        """Fly 4 ms on these motor commands, (4,) 0..1 in motor order; not finite counts as 0."""
+        commands = np.nan_to_num(np.asarray(controls, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+        wind = self._draught.step()
+        self._move_ground()
+        before_q, before_v = self.q_world_body_wxyz.copy(), self.motion.copy()
+        thrust = 0.0
+        for _ in range(self._cfg.substeps):
+            thrust = rotors(
+                commands,
+                self._rotors,
+                self._sites,
+                self.q_world_body_wxyz,
+                self.motion,
+                wind,
+                self._params,
+                self._wrench,
+            )
+            mujoco.mj_step(self._model, self.data)
+        self.thrust_ratio = thrust / (4.0 * self._cfg.max_thrust_n)
+        inertial(before_q, self.q_world_body_wxyz, before_v, self.motion, STEP_S, GRAVITY_MPS2, self.inertial_frd)
+
+    @property
+    def has_contact(self) -> bool:
+        return bool(self.data.ncon)
+
+    @property
+    def touches_store(self) -> bool:
+        """Touches a wall, the ceiling or an obstacle: anything but floor and piles."""
+        return any(self._ground_geom not in pair for pair in self.data.contact.geom.tolist())
+
+    @property
+    def up_cos(self) -> float:
+        """Cosine of the tilt."""
+        _, x, y, _ = self.q_world_body_wxyz.tolist()
+        return float(1.0 - 2.0 * (x * x + y * y))
+
+    def _place(self, start: tuple[float, float, float]) -> None:
+        x, y, yaw = start
+        tilt = np.array(tilt_wxyz(*self._surface.slope(x, y)))
+        heading = np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
+        mujoco.mju_mulQuat(self.q_world_body_wxyz, tilt, heading)
+        self.position[:] = x, y, self._surface.height(x, y) - FOOT_Z_M
+        for _ in range(SETTLE_STEPS):
+            self.step(np.zeros(4))
+        self._rotors[:] = 0.0
+
+    def _move_ground(self) -> None:
+        """Lay the ground plane under the vehicle, tilted like the surface there."""
+        x, y, z = self.position.tolist()
+        height = self._surface.height(x, y)
+        if z - height > GROUND_NEAR_M:
+            self._ground_pos[2] = -100.0
+            return
+        self._ground_pos[:] = x, y, height
+        self._ground_quat[:] = tilt_wxyz(*self._surface.slope(x, y))
+
+
+class Draught:
+    """Mean wind plus gusts: a first-order Gauss-Markov process in each axis."""
+
+    def __init__(self, cfg: Wind, seed: int) -> None:
+        self._mean = np.array(cfg.mean_mps)
+        self._keep = math.exp(-STEP_S / cfg.gust_time_s)
+        self._kick = math.sqrt(1.0 - self._keep**2) * cfg.gust_mps * np.array([1.0, 1.0, 0.5])
+        self._gust = np.zeros(3)
+        self._normals = Normals(stream(seed, "wind"), 3) if cfg.gust_mps > 0.0 else None
+
+    def step(self) -> Array:
+        """(3,) m/s in `world` for the next 4 ms."""
+        if self._normals is None:
+            return self._mean
+        self._gust = self._keep * self._gust + self._kick * self._normals.draw()
+        return self._mean + self._gust
