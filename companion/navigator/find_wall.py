@@ -1,0 +1,182 @@
+"""To the hall's wall from anywhere in it: back off if it is too near, else turn to it and fly up to it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.config import NavigatorConfig
+from companion.geometry import wrap_angle
+from companion.messages import Array
+from companion.navigator.scan_view import BEARING_RAD, DIRECTION, SECTORS, ScanView, Wall
+from companion.navigator.wall_follower import (
+    BRAKE_GAIN_PER_S,
+    FRONT_RAD,
+    TURN_MARGIN_M,
+    YAW_GAIN_PER_S,
+    Pose2,
+    Steering,
+)
+
+EDGE_JUMP_M = 1.5  # a surface that ends with what lies behind it so much farther away stands in front of it
+MAX_ISLAND_WIDTH_M = 15.0
+MAX_HOLE_SECTORS = 6  # drop-outs in a wall are not its end
+TRIED_DEG = 5
+
+
+TOO_NEAR_M = 0.5  # nearer than D by this: back off first
+FACING_RAD = math.radians(5)
+
+
+@dataclass(frozen=True, slots=True)
+class Island:
+    """A round place in map that was gone round and is not the hall's wall."""
+
+    x: float
+    y: float
+    radius_m: float
+
+
+class Phase(Enum):
+    LOOK = "look"
+    RETREAT = "retreat"
+    ORIENT = "orient"
+    APPROACH = "approach"
+    FOUND = "found"
+
+
+class WallFinder:
+    """From a hover to a wall at distance D; then `phase` is FOUND and `wall` the one to turn to (body bearing)."""
+
+    def __init__(self, cfg: NavigatorConfig, lane_m: float) -> None:
+        self._cfg = cfg
+        self._lane = lane_m
+        self._turn_rate = math.radians(cfg.turn_rate_dps)
+        self._target_yaw = 0.0
+        self._away_yaw = 0.0
+        self._near_m = math.inf
+        self._front_m = math.inf
+        self.phase = Phase.LOOK
+        self.wall: Wall | None = None
+
+    def see(self, view: ScanView, pose: Pose2, islands: tuple[Island, ...]) -> None:
+        """Take in a new scan and the pose it was taken at."""
+        near = view.nearest(-math.pi, math.pi)
+        if near is None:
+            self.phase = Phase.LOOK
+            return
+        self._near_m = near[0]
+        if self.phase is Phase.LOOK:
+            self._look(view, pose, islands)
+        if self.phase is Phase.RETREAT:
+            self._away_yaw = wrap_angle(pose.yaw + near[1] + math.pi)
+            room, _ = view.ahead(near[1] + math.pi, 0.5 * self._lane, 0.5 * self._lane)
+            if self._near_m >= self._cfg.wall_distance_m - 0.2 or room < max(self._near_m, self._lane) + 0.3:
+                self._found(view, near[1])
+        elif self.phase is Phase.APPROACH:
+            self._front_m, front = view.ahead(0.0, self._lane, self._lane)
+            if self._front_m <= self._cfg.wall_distance_m + TURN_MARGIN_M:
+                self._found(view, front)
+            elif self._near_m < self._cfg.wall_distance_m - TOO_NEAR_M:
+                self._found(view, near[1])
+
+    def step(self, pose: Pose2, speed_mps: float) -> Steering:
+        """What to do now at most at this speed."""
+        off = wrap_angle(self._target_yaw - pose.yaw)
+        turn = max(-self._turn_rate, min(self._turn_rate, YAW_GAIN_PER_S * off))
+        if self.phase is Phase.ORIENT and abs(off) < FACING_RAD:
+            self.phase = Phase.APPROACH
+        if self.phase is Phase.RETREAT:
+            speed = min(speed_mps, 0.1 + 0.4 * max(0.0, self._cfg.wall_distance_m - self._near_m))
+            bearing = self._away_yaw - pose.yaw
+            return self._steer(speed * math.cos(bearing), speed * math.sin(bearing), 0.0)
+        if self.phase is Phase.ORIENT:
+            return self._steer(0.0, 0.0, turn)
+        if self.phase is Phase.APPROACH:
+            brake = BRAKE_GAIN_PER_S * (self._front_m - self._cfg.wall_distance_m)
+            return self._steer(min(speed_mps, max(0.05, brake)), 0.0, turn)
+        return self._steer(0.0, 0.0, 0.0)
+
+    def _look(self, view: ScanView, pose: Pose2, islands: tuple[Island, ...]) -> None:
+        if self._near_m < self._cfg.wall_distance_m - TOO_NEAR_M:
+            self.phase = Phase.RETREAT
+            return
+        bearing = wall_bearing(view, pose, self._lane, islands)
+        if bearing is not None:
+            self._target_yaw = wrap_angle(pose.yaw + bearing)
+            self._front_m, _ = view.ahead(bearing, self._lane, self._lane)
+            self.phase = Phase.ORIENT
+
+    def _found(self, view: ScanView, bearing_rad: float) -> None:
+        self.wall = view.wall(bearing_rad - FRONT_RAD, bearing_rad + FRONT_RAD)
+        if self.wall is not None:
+            self.phase = Phase.FOUND
+
+    def _steer(self, forward: float, left: float, yaw_rate: float) -> Steering:
+        return Steering(forward, left, yaw_rate, False, None, self._front_m)
+
+
+def wall_bearing(view: ScanView, pose: Pose2, lane_m: float, islands: tuple[Island, ...]) -> float | None:
+    """Body bearing of the shortest free lane to a wall; None if nothing is seen.
+
+    Free-standing things (both ends in front of something far behind, or gone round before) are no walls, unless there
+    is nothing else.
+    """
+    standing = free_standing(view.smooth_m) | _within(view.smooth_m, pose, islands)
+    best: tuple[bool, float, float] | None = None
+    for n in range(0, SECTORS, TRIED_DEG):
+        distance, hit_rad = view.ahead(float(BEARING_RAD[n]), lane_m, lane_m)
+        if math.isfinite(distance):
+            hit = round(math.degrees(hit_rad)) % SECTORS
+            tried = (bool(standing[hit]), distance, float(BEARING_RAD[n]))
+            best = tried if best is None or tried < best else best
+    return None if best is None else best[2]
+
+
+def free_standing(smooth_m: Array) -> NDArray[np.bool_]:
+    """(360,) True where a surface seems to be an island: narrow, with a step outward at both ends."""
+    ranges = _without_holes(smooth_m)
+    step = np.roll(ranges, -1) - ranges  # from sector n to n + 1, counter-clockwise
+    with np.errstate(invalid="ignore"):
+        edges = np.flatnonzero(np.abs(step) > EDGE_JUMP_M)  # between n and n + 1; inf - inf is no edge
+    out = np.zeros(SECTORS, dtype=np.bool_)
+    for start, end in zip(edges, np.roll(edges, -1), strict=True):
+        members = np.arange(start + 1, end + 1 + (SECTORS if end <= start else 0)) % SECTORS
+        if len(edges) < 2 or not np.isfinite(ranges[members]).all():
+            continue
+        outward = step[start] < 0 and step[end] > 0
+        ends = ranges[members[[0, -1]], None] * DIRECTION[members[[0, -1]]]
+        width = math.hypot(*(ends[0] - ends[1]))
+        if outward and width < MAX_ISLAND_WIDTH_M and len(members) < SECTORS // 3:
+            out[members] = True
+    return out
+
+
+def _without_holes(ranges: Array) -> Array:
+    """Short gaps filled from their nearer side."""
+    filled = ranges.copy()
+    finite = np.isfinite(ranges)
+    if not finite.any():
+        return filled
+    for n in np.flatnonzero(~finite):
+        for reach in range(1, MAX_HOLE_SECTORS):
+            before, after = ranges[(n - reach) % SECTORS], ranges[(n + reach) % SECTORS]
+            if math.isfinite(before) or math.isfinite(after):
+                filled[n] = min(before, after)
+                break
+    return filled
+
+
+def _within(ranges: Array, pose: Pose2, islands: tuple[Island, ...]) -> NDArray[np.bool_]:
+    out = np.zeros(SECTORS, dtype=np.bool_)
+    finite = np.isfinite(ranges)
+    reach = np.where(finite, ranges, 0.0)
+    x = pose.x + reach * np.cos(BEARING_RAD + pose.yaw)
+    y = pose.y + reach * np.sin(BEARING_RAD + pose.yaw)
+    for island in islands:
+        out |= finite & (np.hypot(x - island.x, y - island.y) < island.radius_m)
+    return out
