@@ -1,0 +1,150 @@
+"""Height of the body above where it stood, and the tilt error, kept from scan to scan."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.messages import Array, RangefinderSample
+from companion.odometry import filter as kalman
+from companion.odometry.attitude import AttitudeHistory
+from companion.odometry.height_map import HeightFit, HeightMap
+from companion.odometry.wall_map import WallMap
+
+RANGEFINDER_SIGMA_M = 0.03
+RANGEFINDER_RADIUS_M = 1.0  # about the start: there the floor below is known from standing on it
+Z_FLOOR_SIGMA_M = 0.004
+GATE_SIGMAS = 5.0
+MIN_GATE_M = 0.1
+MIN_GROUND_POINTS = 20
+TILT_WALK = 0.001  # rad per sqrt(s): how fast the attitude's error wanders
+TILT_SIGMA_RAD = 0.01  # how large it is thought to be
+MAX_TILT_RAD = math.radians(4.0)
+MAX_REJECTED = 10
+
+
+@dataclass(frozen=True, slots=True)
+class HeightResult:
+    """correction: (3,) of z, roll, pitch against the prediction; z_sigma_m of it; ground: points for the map."""
+
+    correction: Array
+    z_sigma_m: float
+    new_ground: Array
+    ground_points: int
+    wall_points: int
+
+
+class HeightTracker:
+    """Fits each scan's lower layers to the ground map; near the start the rangefinder helps."""
+
+    def __init__(self, sensor_up_m: float) -> None:
+        self.ground = HeightMap()
+        self.is_standing = True
+        self.map_variance = 0.0
+        self._sensor_up_m = sensor_up_m
+        self._rangefinder: deque[RangefinderSample] = deque(maxlen=64)
+        self._rest: list[float] = []
+        self._tilt = np.zeros(2)
+        self._tilt_p = np.eye(2) * TILT_SIGMA_RAD**2
+        self._highest_m = 0.0
+        self._rejected = 0
+        self._t_ns = 0
+
+    @property
+    def tilt_offset_rad(self) -> tuple[float, float]:
+        return float(self._tilt[0]), float(self._tilt[1])
+
+    @property
+    def floor_m(self) -> float | None:
+        """Floor under the start, in map: known from the rangefinder while standing."""
+        return -float(np.median(self._rest)) if len(self._rest) >= 5 else None
+
+    def floor_below_m(self, z_m: float) -> float:
+        """Levelled height under which a point of the horizontal layer is the floor, not a wall."""
+        floor = self.floor_m
+        return -math.inf if floor is None else floor - z_m + 0.1
+
+    def on_rangefinder(self, sample: RangefinderSample) -> None:
+        """Not finite, or not positive: nothing below within range."""
+        if not (math.isfinite(sample.distance_m) and sample.distance_m > 0.0):
+            return
+        if self.is_standing and len(self._rest) < 400:
+            self._rest.append(sample.distance_m)
+        self._rangefinder.append(sample)
+
+    def fit(self, lower: Array, pose: Array, vertical: kalman.Vertical, walls: WallMap, sigma_m: float) -> HeightFit:
+        sigma_z = math.sqrt(float(vertical.p[0, 0]))
+        return self.ground.fit(
+            lower,
+            pose,
+            float(vertical.x[0]),
+            walls,
+            sigma_range_m=sigma_m,
+            gate_m=0.5 + 3.0 * sigma_z,
+            seen_spread_m=self._highest_m,
+        )
+
+    def update(
+        self,
+        lower: Array,
+        pose: Array,
+        vertical: kalman.Vertical,
+        history: AttitudeHistory,
+        walls: WallMap,
+        sigma_m: float,
+    ) -> tuple[kalman.Vertical, HeightResult]:
+        """Vertical state after this scan. lower: (N, 3) levelled points of the layers below the horizontal one."""
+        vertical = self._use_rangefinder(vertical, pose, history)
+        fit = self.fit(lower, pose, vertical, walls, sigma_m)
+        self._highest_m = max(self._highest_m, float(vertical.x[0]))
+        dt_s = max(0.0, (vertical.t_ns - self._t_ns) * 1e-9) if self._t_ns else 0.0
+        self._t_ns = vertical.t_ns
+        sigma_z = math.inf
+        if fit.ground_points >= MIN_GROUND_POINTS:
+            prior = np.diag([1e-3, 1.0 / 0.005**2, 1.0 / 0.005**2])
+            covariance = np.linalg.inv(fit.information + prior)
+            sigma_z = math.sqrt(float(covariance[0, 0]) + Z_FLOOR_SIGMA_M**2)
+            gate = max(MIN_GATE_M, GATE_SIGMAS * math.hypot(math.sqrt(float(vertical.p[0, 0])), sigma_z))
+            if abs(fit.correction[0]) < gate or self._rejected >= MAX_REJECTED:
+                vertical = kalman.update_vertical(vertical, float(vertical.x[0] + fit.correction[0]), sigma_z**2)
+                self.map_variance = fit.map_variance
+                self._rejected = 0
+            else:
+                self._rejected += 1
+        if fit.wall_points >= MIN_GROUND_POINTS:
+            self._track_tilt(fit, dt_s)
+        ground = fit.new_ground
+        result = HeightResult(fit.correction, sigma_z, ground, fit.ground_points, fit.wall_points)
+        return vertical, result
+
+    def _track_tilt(self, fit: HeightFit, dt_s: float) -> None:
+        """A random walk that is drawn back to 0, measured by the points on walls and ground."""
+        information = np.linalg.inv(np.linalg.inv(fit.information + np.diag([1e-3, 1e2, 1e2]))[1:, 1:])
+        prior = 1.0 / 0.005**2
+        back = min(1.0, dt_s * (TILT_WALK / TILT_SIGMA_RAD) ** 2 / 2)
+        self._tilt = self._tilt * (1.0 - back)
+        p = self._tilt_p * (1.0 - back) ** 2 + np.eye(2) * TILT_WALK**2 * dt_s
+        ml = np.linalg.solve(information, (information + np.eye(2) * prior) @ fit.correction[1:])
+        noise = np.linalg.inv(information) + np.eye(2) * 0.0005**2
+        gain = p @ np.linalg.inv(p + noise)
+        self._tilt = np.clip(self._tilt + gain @ ml, -MAX_TILT_RAD, MAX_TILT_RAD)
+        self._tilt_p = p - gain @ p
+
+    def _use_rangefinder(self, vertical: kalman.Vertical, pose: Array, history: AttitudeHistory) -> kalman.Vertical:
+        """Above the start the reading, made plumb, is the height: the floor there is known from standing on it."""
+        readings = [s for s in self._rangefinder if self._t_ns < s.t_ns <= vertical.t_ns]
+        floor = self.floor_m
+        if not readings or floor is None or math.hypot(pose[0], pose[1]) > RANGEFINDER_RADIUS_M:
+            return vertical
+        newest = readings[-1]
+        roll, pitch = history.at(np.array([newest.t_ns], np.int64))[0, :2]
+        age_s = (vertical.t_ns - newest.t_ns) * 1e-9
+        z = newest.distance_m * math.cos(roll) * math.cos(pitch) + floor + age_s * float(vertical.x[1])
+        sigma_z = math.sqrt(float(vertical.p[0, 0]))
+        if abs(z - vertical.x[0]) > max(0.3, GATE_SIGMAS * math.hypot(sigma_z, RANGEFINDER_SIGMA_M)):
+            return vertical
+        variance = RANGEFINDER_SIGMA_M**2 + (0.01 * newest.distance_m) ** 2
+        return kalman.update_vertical(vertical, float(z), variance)

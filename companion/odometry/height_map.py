@@ -1,0 +1,153 @@
+"""Height above the floor of the start, and the tilt that the attitude errs by, from the lower layers.
+
+The lower layers are matched to a 2.5D map of the ground, built while flying; where they hit walls, those tell tilt,
+since walls are vertical. Tilt and height are found together: a tilt of 0.3 deg would else pass for centimetres of
+height.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.messages import Array
+from companion.odometry import height_kernels as hk
+from companion.odometry.wall_map import MARGIN_CELLS, MAX_CELLS, WallMap
+
+MAX_POINTS = 3072  # of a scan; more are thinned evenly
+TILT_PRIOR_RAD = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class HeightFit:
+    """Errors of the guess: z, roll, pitch; information (3, 3) of the points alone; counts; scale of the residuals."""
+
+    correction: Array
+    information: Array
+    ground_points: int
+    wall_points: int
+    scale: float
+    map_variance: float
+    new_ground: Array  # (N, 3) levelled points to be put into the map when the scan is accepted
+
+
+class HeightMap:
+    """Ground height in a grid of moments; window 3 x 3 cells."""
+
+    def __init__(self, cell_m: float = 0.5) -> None:
+        self.cell_m = cell_m
+        self.origin = np.zeros(2)
+        self._allocate(0, 0)
+
+    def _allocate(self, ny: int, nx: int) -> None:
+        self.sums = np.zeros((ny, nx, hk.SUMS))
+        self.state = np.zeros((ny, nx), np.uint8)
+        self.planes = np.zeros((ny, nx, hk.PLANE))
+
+    def fit(
+        self,
+        points_level: Array,
+        pose: Array,
+        z_m: float,
+        walls: WallMap,
+        *,
+        sigma_range_m: float,
+        gate_m: float,
+        seen_spread_m: float,
+    ) -> HeightFit:
+        """Match (N, 3) levelled points of the lower layers at pose (x, y, yaw) and height z_m.
+
+        gate_m: how far a point may be off the known ground. seen_spread_m: range of heights flown through so far.
+        """
+        if len(points_level) > MAX_POINTS:
+            points_level = points_level[:: -(-len(points_level) // MAX_POINTS)]
+        n = len(points_level)
+        kind: NDArray[np.int64] = np.zeros(n, np.int64)
+        place: NDArray[np.int64] = np.zeros(n, np.int64)
+        min_spread = min(0.6, 0.5 * seen_spread_m)
+        hk.classify(
+            self.sums,
+            self.state,
+            self.planes,
+            self.origin,
+            self.cell_m,
+            walls.sums,
+            walls.spread,
+            walls.state,
+            walls.lines,
+            walls.origin,
+            walls.cell_m,
+            points_level,
+            pose,
+            z_m,
+            gate_m,
+            min_spread,
+            kind,
+            place,
+        )
+        tilt = 1.0 / TILT_PRIOR_RAD**2
+        correction, information, out = hk.fit_height(
+            self.planes,
+            walls.lines,
+            points_level,
+            pose,
+            z_m,
+            kind,
+            place,
+            sigma_range_m,
+            np.array([1e-3, tilt, tilt]),
+            4,
+        )
+        return HeightFit(
+            correction=correction,
+            information=information,
+            ground_points=int(out[0]),
+            wall_points=int(out[1]),
+            scale=float(out[2]),
+            map_variance=float(out[3]),
+            new_ground=points_level[kind == hk.GROUND],
+        )
+
+    def height_at(self, x_m: float, y_m: float) -> tuple[float, float] | None:
+        """Ground height and its variance at a place, or None where it is not known."""
+        ny, nx = self.state.shape
+        ix, iy = (
+            int(np.floor((x_m - self.origin[0]) / self.cell_m)),
+            int(np.floor((y_m - self.origin[1]) / self.cell_m)),
+        )
+        if not (0 <= ix < nx and 0 <= iy < ny):
+            return None
+        if self.state[iy, ix] == hk.DIRTY:
+            hk.fit_plane(self.sums, self.state, self.planes, iy, ix)
+        if self.state[iy, ix] != hk.VALID:
+            return None
+        p = self.planes[iy, ix]
+        dx, dy = x_m - p[hk.CX], y_m - p[hk.CY]
+        z = p[hk.A] + p[hk.BX] * dx + p[hk.BY] * dy
+        slope = dx * dx * p[hk.SXX] + 2 * dx * dy * p[hk.SXY] + dy * dy * p[hk.SYY]
+        return float(z), float(p[hk.ABOUT] / p[hk.WEIGHT] + slope)
+
+    def insert(self, points_map: Array, distance_m: Array, variance_z: float) -> None:
+        """Add ground points (N, 3); distance_m: (N,) horizontal, from the sensor."""
+        if len(points_map) == 0:
+            return
+        self._cover(points_map[:, :2])
+        hk.insert_heights(self.sums, self.state, self.origin, self.cell_m, points_map, distance_m, variance_z)
+
+    def _cover(self, points: Array) -> None:
+        low = np.floor((points.min(axis=0) - self.origin) / self.cell_m).astype(np.int64)
+        high = np.floor((points.max(axis=0) - self.origin) / self.cell_m).astype(np.int64)
+        ny, nx = self.state.shape
+        if low[0] >= 0 and low[1] >= 0 and high[0] < nx and high[1] < ny:
+            return
+        before = np.where(low < 0, -low + MARGIN_CELLS, 0)
+        after = np.where(high >= (nx, ny), high - (nx, ny) + 1 + MARGIN_CELLS, 0)
+        new_nx, new_ny = int(nx + before[0] + after[0]), int(ny + before[1] + after[1])
+        if new_nx * new_ny > MAX_CELLS:
+            return
+        old = self.sums
+        self._allocate(new_ny, new_nx)
+        self.sums[before[1] : before[1] + ny, before[0] : before[0] + nx] = old
+        self.origin = self.origin - before * self.cell_m

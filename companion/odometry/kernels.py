@@ -1,0 +1,291 @@
+"""The wall map's inner loops: lines in a grid of moments, and registration of points to them.
+
+Cells hold sums over the points that fell into them; the line of a cell is fitted to the window of (2 WINDOW + 1)^2
+cells around it, so that a wall on a cell's border is not cut in two. A window of fixed borders fits without bias,
+however oblique the beams: along a long wall the noise moves as many points into the window as out of it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.messages import Array
+from companion.odometry.jit import kernel
+
+WINDOW = 2
+# sums of a cell: weight, x, y, xx, xy, yy, height, pose variance in x, y, yaw
+W, X, Y, XX, XY, YY, Z, VX, VY, VYAW = range(10)
+SUMS = 10
+# a line: normal (2), point on it (2), variance across, weight, variance along, pose variance x, y, yaw, height spread
+NX, NY, CX, CY, ACROSS, WEIGHT, ALONG, PX, PY, PYAW, SPREAD = range(11)
+LINE = 11
+DIRTY, VALID, NO_LINE = 0, 1, 2
+
+MIN_WEIGHT = 5.0
+MAX_SLENDER = 0.35  # variance across / along above which a window holds no line
+HEIGHT_MEMORY_M = 3.0  # a wall is not quite the same higher up: sums from further off than this are capped
+HEIGHT_CAP = 100.0
+ANGULAR_SIGMA_RAD = 0.0015  # of a beam's direction: time stamps, attitude, the sensor's own
+TUKEY = 4.685
+CORRELATED = 8.0  # points of one scan that share a line, and so its error
+
+
+@kernel
+def insert_points(
+    sums: Array,
+    spread: Array,
+    state: NDArray[np.uint8],
+    origin: Array,
+    cell_m: float,
+    points_map: Array,
+    z_m: float,
+    variances: Array,
+) -> None:
+    """Add points (N, 2) seen from height z_m with a pose of those variances (x, y, yaw); all must lie in the grid.
+
+    spread: (ny, nx, 2) lowest and highest z at which each cell was seen.
+    """
+    ny, nx = state.shape
+    for i in range(points_map.shape[0]):
+        ix = math.floor((points_map[i, 0] - origin[0]) / cell_m)
+        iy = math.floor((points_map[i, 1] - origin[1]) / cell_m)
+        if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
+            continue
+        s = sums[iy, ix]
+        if s[W] > HEIGHT_CAP and abs(s[Z] / s[W] - z_m) > HEIGHT_MEMORY_M:
+            shrink = HEIGHT_CAP / s[W]
+            for k in range(SUMS):
+                s[k] *= shrink
+        x, y = points_map[i, 0], points_map[i, 1]
+        if s[W] == 0.0:
+            spread[iy, ix, 0] = z_m
+            spread[iy, ix, 1] = z_m
+        s[W] += 1.0
+        s[X] += x
+        s[Y] += y
+        s[XX] += x * x
+        s[XY] += x * y
+        s[YY] += y * y
+        s[Z] += z_m
+        s[VX] += variances[0]
+        s[VY] += variances[1]
+        s[VYAW] += variances[2]
+        spread[iy, ix, 0] = min(spread[iy, ix, 0], z_m)
+        spread[iy, ix, 1] = max(spread[iy, ix, 1], z_m)
+        for jy in range(max(0, iy - WINDOW), min(ny, iy + WINDOW + 1)):
+            for jx in range(max(0, ix - WINDOW), min(nx, ix + WINDOW + 1)):
+                state[jy, jx] = DIRTY
+
+
+@kernel
+def fit_line(sums: Array, spread: Array, state: NDArray[np.uint8], lines: Array, iy: int, ix: int) -> None:
+    """Fit the window about a cell anew and remember it; the state says whether it is a line."""
+    ny, nx = state.shape
+    total = np.zeros(SUMS)
+    seen_spread = 0.0
+    for jy in range(max(0, iy - WINDOW), min(ny, iy + WINDOW + 1)):
+        for jx in range(max(0, ix - WINDOW), min(nx, ix + WINDOW + 1)):
+            w = sums[jy, jx, W]
+            if w > 0.0:
+                for k in range(SUMS):
+                    total[k] += sums[jy, jx, k]
+                seen_spread += w * (spread[jy, jx, 1] - spread[jy, jx, 0])
+    state[iy, ix] = NO_LINE
+    w = total[W]
+    if w < MIN_WEIGHT:
+        return
+    mx, my = total[X] / w, total[Y] / w
+    cxx = max(total[XX] / w - mx * mx, 0.0)
+    cyy = max(total[YY] / w - my * my, 0.0)
+    cxy = total[XY] / w - mx * my
+    half = 0.5 * (cxx + cyy)
+    root = math.sqrt(0.25 * (cxx - cyy) ** 2 + cxy * cxy)
+    along, across = half + root, max(half - root, 0.0)
+    if along <= 0.0 or across > MAX_SLENDER * along:
+        return
+    angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)  # of the line
+    line = lines[iy, ix]
+    line[NX], line[NY] = -math.sin(angle), math.cos(angle)
+    line[CX], line[CY] = mx, my
+    line[ACROSS], line[WEIGHT], line[ALONG] = across, w, along
+    line[PX], line[PY], line[PYAW] = total[VX] / w, total[VY] / w, total[VYAW] / w
+    line[SPREAD] = seen_spread / w
+    state[iy, ix] = VALID
+
+
+@kernel
+def associate(
+    sums: Array,
+    spread: Array,
+    state: NDArray[np.uint8],
+    lines: Array,
+    origin: Array,
+    cell_m: float,
+    points: Array,
+    pose: Array,
+    gate_m: float,
+    found: NDArray[np.int64],
+) -> int:
+    """The cell (flat index, -1: none) whose line each point belongs to; returns how many have one."""
+    ny, nx = state.shape
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    n = 0
+    for i in range(points.shape[0]):
+        found[i] = -1
+        x = c * points[i, 0] - s * points[i, 1] + pose[0]
+        y = s * points[i, 0] + c * points[i, 1] + pose[1]
+        ix = math.floor((x - origin[0]) / cell_m)
+        iy = math.floor((y - origin[1]) / cell_m)
+        if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
+            continue
+        if state[iy, ix] == DIRTY:
+            fit_line(sums, spread, state, lines, iy, ix)
+        if state[iy, ix] != VALID:
+            continue
+        line = lines[iy, ix]
+        if abs(line[NX] * (x - line[CX]) + line[NY] * (y - line[CY])) > gate_m:
+            continue
+        found[i] = iy * nx + ix
+        n += 1
+    return n
+
+
+@kernel
+def linearise(
+    lines: Array,
+    points: Array,
+    found: NDArray[np.int64],
+    pose: Array,
+    sigma_range_m: float,
+    sigma_surface_m: float,
+    scale: float,
+    residual: Array,
+    system: Array,
+    statistics: Array,
+) -> None:
+    """Normal equations of the point-to-line residuals at a pose, Tukey-weighted.
+
+    residual: (N,) out, each in its own sigma (NaN where unmatched). system: (3, 4) out, H and g.
+    statistics: (6,) out: sum of weights, weighted share of inliers, normals' outer product xx, xy, yy, pose variance.
+    """
+    flat = lines.reshape(-1, LINE)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    system[:] = 0.0
+    statistics[:] = 0.0
+    for i in range(points.shape[0]):
+        residual[i] = np.nan
+        if found[i] < 0:
+            continue
+        line = flat[found[i]]
+        px, py = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
+        dx, dy = px + pose[0] - line[CX], py + pose[1] - line[CY]
+        r = line[NX] * dx + line[NY] * dy
+        far = math.sqrt(px * px + py * py)
+        cos2 = min(1.0, ((line[NX] * px + line[NY] * py) / max(far, 1e-6)) ** 2)
+        off = -line[NY] * dx + line[NX] * dy
+        variance = (
+            cos2 * sigma_range_m**2
+            + (1.0 - cos2) * (ANGULAR_SIGMA_RAD * far) ** 2
+            + sigma_surface_m**2
+            + CORRELATED * line[ACROSS] / line[WEIGHT] * (1.0 + off * off / line[ALONG])
+        )
+        u = r / math.sqrt(variance)
+        residual[i] = u
+        v = u / (TUKEY * scale)
+        if abs(v) >= 1.0:
+            continue
+        w = (1.0 - v * v) ** 2 / (variance * scale * scale)
+        jyaw = -line[NX] * py + line[NY] * px
+        system[0, 0] += w * line[NX] * line[NX]
+        system[0, 1] += w * line[NX] * line[NY]
+        system[0, 2] += w * line[NX] * jyaw
+        system[1, 1] += w * line[NY] * line[NY]
+        system[1, 2] += w * line[NY] * jyaw
+        system[2, 2] += w * jyaw * jyaw
+        system[0, 3] += w * line[NX] * r
+        system[1, 3] += w * line[NY] * r
+        system[2, 3] += w * jyaw * r
+        statistics[0] += w
+        statistics[1] += 1.0
+        statistics[2] += w * line[PX]
+        statistics[3] += w * line[PY]
+        statistics[4] += w * line[PYAW]
+    system[1, 0] = system[0, 1]
+    system[2, 0] = system[0, 2]
+    system[2, 1] = system[1, 2]
+
+
+@kernel
+def solve3(a: Array, b: Array) -> Array:
+    """Solve a symmetric positive definite (3, 3) system by Cholesky."""
+    l00 = math.sqrt(max(a[0, 0], 1e-12))
+    l10, l20 = a[1, 0] / l00, a[2, 0] / l00
+    l11 = math.sqrt(max(a[1, 1] - l10 * l10, 1e-12))
+    l21 = (a[2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(max(a[2, 2] - l20 * l20 - l21 * l21, 1e-12))
+    y0 = b[0] / l00
+    y1 = (b[1] - l10 * y0) / l11
+    y2 = (b[2] - l20 * y0 - l21 * y1) / l22
+    x = np.empty(3)
+    x[2] = y2 / l22
+    x[1] = (y1 - l21 * x[2]) / l11
+    x[0] = (y0 - l10 * x[1] - l20 * x[2]) / l00
+    return x
+
+
+@kernel
+def register_to_lines(
+    sums: Array,
+    spread: Array,
+    state: NDArray[np.uint8],
+    lines: Array,
+    origin: Array,
+    cell_m: float,
+    points: Array,
+    guess: Array,
+    prior_information: Array,
+    sigma_range_m: float,
+    sigma_surface_m: float,
+    gate_m: float,
+    max_iterations: int,
+) -> tuple[Array, Array, Array]:
+    """Gauss-Newton on Tukey-weighted point-to-line residuals and a prior about the guess.
+
+    Returns: pose (3,); H (3, 3) of the points alone; (9,) iterations, converged, points matched, inliers, scale of the
+    residuals in their expected sigma, mean pose variance x, y, yaw of the lines used, share of the points matched.
+    """
+    n = points.shape[0]
+    found = np.empty(n, np.int64)
+    residual = np.empty(n)
+    system = np.zeros((3, 4))
+    statistics = np.zeros(6)
+    pose = guess.copy()
+    out = np.zeros(9)
+    scale = 2.0
+    for iteration in range(max_iterations):
+        matched = associate(sums, spread, state, lines, origin, cell_m, points, pose, gate_m, found)
+        out[0] = iteration + 1.0
+        out[2] = matched
+        if matched < 6:
+            break
+        if iteration < 3:  # the spread of the residuals about zero, robustly
+            linearise(lines, points, found, pose, sigma_range_m, sigma_surface_m, scale, residual, system, statistics)
+            scale = min(max(1.4826 * np.nanmedian(np.abs(residual)), 0.7), 4.0)
+        linearise(lines, points, found, pose, sigma_range_m, sigma_surface_m, scale, residual, system, statistics)
+        a = system[:, :3] + prior_information
+        g = system[:, 3] + prior_information @ (pose - guess)
+        step = solve3(a, g)
+        pose = pose - step
+        if abs(step[0]) < 2e-4 and abs(step[1]) < 2e-4 and abs(step[2]) < 2e-5:
+            out[1] = 1.0
+            break
+    out[3] = statistics[1]
+    out[4] = scale
+    if statistics[0] > 0.0:
+        for k in range(3):
+            out[5 + k] = statistics[2 + k] / statistics[0]
+    out[8] = out[2] / max(n, 1)
+    return pose, system[:, :3].copy(), out

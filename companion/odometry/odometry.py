@@ -1,0 +1,294 @@
+"""The odometry stage: scans, attitude and rangefinder in, the pose of the body in `map` out.
+
+Two rates: each scan is registered to the wall map as it stood at the last keyframe; at a keyframe the scans since then
+are put into the map, placed by their filtered poses. Seen once is seen for good: the map forgets nothing, so that the
+walls of the first keyframe hold the pose for the whole flight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.config import CompanionConfig
+from companion.geometry import rotation2
+from companion.messages import (
+    Array,
+    AttitudeSample,
+    LevelledScan,
+    LidarScan,
+    OdometryEstimate,
+    RangefinderSample,
+    WallRanges,
+)
+from companion.odometry import filter as kalman
+from companion.odometry.attitude import AttitudeBuffer, AttitudeHistory
+from companion.odometry.degeneracy import Judgement, judge
+from companion.odometry.estimate import Snapshot, estimate_at
+from companion.odometry.height import HeightTracker
+from companion.odometry.level import Leveller, block_means
+from companion.odometry.ranges import wall_ranges
+from companion.odometry.relocalise import relocalise
+from companion.odometry.standstill import Standstill
+from companion.odometry.wall_map import Registration, WallMap
+
+PRIOR_SIGMA = np.array([0.06, 0.06, 0.02])  # m, m, rad: holds a registration where the walls do not
+FLOOR_SIGMA = np.array([0.004, 0.004, 0.0004])  # what a registration errs by at best: roughness, time stamps
+KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
+MAX_PENDING = 100  # scans kept until the next keyframe
+STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
+FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
+MIN_VALID_COLUMNS_RATIO = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanResult:
+    """What one scan gave. registration and judgement: None for the first scan, which makes the map.
+
+    is_yaw_weak: the walls alone do not tell yaw (a round silo), the gyro carries it.
+    """
+
+    estimate: OdometryEstimate
+    levelled: LevelledScan
+    wall_ranges: WallRanges
+    keyframe: bool
+    registration: Registration | None
+    judgement: Judgement | None
+    is_standing: bool
+    is_yaw_weak: bool
+    tilt_offset_rad: tuple[float, float]
+
+
+class _Pending(NamedTuple):
+    """A registered scan that waits for the next keyframe: layer (N, 2), ground (M, 3), levelled; pose x, y, yaw, z."""
+
+    layer: Array
+    ground: Array
+    pose: Array
+    z_m: float
+    variance: Array  # (4,) x, y, yaw, z
+
+
+class Odometry:
+    """One instance for one flight. on_attitude, on_rangefinder and predict may be called while on_scan runs in another
+    thread: what they share is immutable and replaced by single assignments."""
+
+    def __init__(self, cfg: CompanionConfig) -> None:
+        self._cfg = cfg
+        self._leveller = Leveller(cfg.lidar)
+        self._attitude = AttitudeBuffer()
+        self._snapshot: Snapshot | None = None
+        self.walls = WallMap()
+        self.height = HeightTracker(cfg.lidar.mount_position_m[2])
+        self._standstill = Standstill()
+        self._standing_scans = 0
+        self._pending: list[_Pending] = []
+        self._sigma_range_m = 0.1
+        self._accepted = 0
+        self._rejected_in_row = 0
+        self._keyframe_t_ns = 0
+        self._keyframe_z_m = 0.0
+        self._base_variance = np.zeros(3)
+        self.dropped: dict[str, int] = {"repeated": 0, "no attitude": 0, "too few columns": 0}
+        self.rejected: dict[str, int] = {}
+
+    # -- inputs
+
+    def on_attitude(self, sample: AttitudeSample) -> None:
+        self._attitude.add(sample)
+
+    def on_rangefinder(self, sample: RangefinderSample) -> None:
+        self.height.on_rangefinder(sample)
+        if np.isfinite(sample.distance_m):
+            self._standstill.on_rangefinder(sample.distance_m)
+
+    def predict(self, t_ns: int) -> OdometryEstimate | None:
+        """The estimate at t_ns (not before the newest scan), or None before the first scan. Cheap; any thread."""
+        snapshot, history = self._snapshot, self._attitude.history
+        if snapshot is None or history is None:
+            return None
+        return estimate_at(snapshot, history, max(t_ns, snapshot.t_scan_ns), is_scan=False)
+
+    def on_scan(self, scan: LidarScan) -> ScanResult | None:
+        """None when the scan cannot be used at all (counted in `dropped`)."""
+        history = self._attitude.history
+        if self._is_unusable(scan, history) or history is None:
+            return None
+        old = self._snapshot
+        planar = kalman.start(scan.t_ns) if old is None else kalman.carry(old.planar, history, scan.t_ns)
+        vertical = kalman.start_vertical(scan.t_ns) if old is None else kalman.carry_vertical(old.vertical, scan.t_ns)
+        velocity = np.array([*(rotation2(-planar.x[6]) @ planar.x[2:4]), vertical.x[1]])
+        levelled, every = self._leveller.level(scan, history, velocity, self.height.tilt_offset_rad)
+        row = scan.geometry.horizontal_row
+        layer3 = levelled.points_level[levelled.row == row]
+        layer = np.ascontiguousarray(layer3[layer3[:, 2] > self.height.floor_below_m(vertical.x[0]), :2])
+        lower = block_means(levelled, row, scan.range_m.shape[1])
+        registration, judgement = None, None
+        if old is None:
+            snapshot = self._first(scan, planar, vertical)
+            ground = self.height.fit(lower, np.zeros(3), vertical, self.walls, self._sigma_range_m).new_ground
+        else:
+            planar, registration, judgement, reset = self._place(planar, layer)
+            self.height.is_standing = self._standstill.is_standing
+            vertical, fit = self.height.update(
+                lower, planar.x[kalman.POSE], vertical, history, self.walls, self._sigma_range_m
+            )
+            ground = fit.new_ground
+            if self._standstill.is_standing:
+                planar, vertical = self._stand(
+                    history, planar, vertical, registration, fit.correction[0], fit.z_sigma_m
+                )
+            snapshot = self._after(old, scan, planar, vertical, registration, judgement, reset)
+        variance = np.append(np.diag(planar.p)[kalman.POSE], vertical.p[0, 0]) + snapshot.map_variance
+        if judgement is None or judgement.is_accepted:
+            self._pending.append(_Pending(layer, ground, planar.x[kalman.POSE], float(vertical.x[0]), variance))
+            del self._pending[:-MAX_PENDING]
+        if snapshot.is_keyframe:
+            self._close_keyframe(scan.t_ns, float(vertical.x[0]), is_first=old is None)
+        self._snapshot = snapshot
+        return ScanResult(
+            estimate=estimate_at(snapshot, history, scan.t_ns, is_scan=True),
+            levelled=levelled,
+            wall_ranges=wall_ranges(scan.t_ns, every, row, self._cfg.lidar.min_range_m),
+            keyframe=snapshot.is_keyframe,
+            registration=registration,
+            judgement=judgement,
+            is_standing=self._standstill.is_standing,
+            is_yaw_weak=judgement is not None and judgement.is_yaw_weak,
+            tilt_offset_rad=self.height.tilt_offset_rad,
+        )
+
+    # -- steps
+
+    def _is_unusable(self, scan: LidarScan, history: AttitudeHistory | None) -> bool:
+        reason = ""
+        if history is None:
+            reason = "no attitude"
+        elif self._snapshot is not None and scan.t_ns <= self._snapshot.t_scan_ns:
+            reason = "repeated"
+        elif float(np.mean(scan.column_valid)) < MIN_VALID_COLUMNS_RATIO:
+            reason = "too few columns"
+        if reason:
+            self.dropped[reason] += 1
+        return bool(reason)
+
+    def _first(self, scan: LidarScan, planar: kalman.Planar, vertical: kalman.Vertical) -> Snapshot:
+        return Snapshot(
+            t_scan_ns=scan.t_ns,
+            planar=planar,
+            vertical=vertical,
+            map_variance=np.zeros(4),
+            tilt_offset_rad=(0.0, 0.0),
+            tilt_variance=0.0,
+            quality=50,
+            reset_counter=0,
+            converged=True,
+            is_degenerate=False,
+            inliers=0,
+            iterations=0,
+            keyframe_id=0,
+            is_keyframe=True,
+        )
+
+    def _place(self, planar: kalman.Planar, layer: Array) -> tuple[kalman.Planar, Registration, Judgement, bool]:
+        """Register the layer from the predicted pose; fuse it if it can be believed; search if it failed for long."""
+        guess = planar.x[kalman.POSE]
+        covariance = planar.p[np.ix_(kalman.POSE, kalman.POSE)]
+        prior = np.asarray(np.linalg.inv(covariance + np.diag(PRIOR_SIGMA**2)), np.float64)
+        registration = self.walls.register(layer, guess, prior, sigma_range_m=self._sigma_range_m)
+        judgement = judge(registration, guess, covariance, len(layer))
+        if judgement.is_accepted:
+            self._rejected_in_row = 0
+            self._accepted += 1
+            self._track_noise(registration.scale)
+            planar = kalman.update(planar, registration.pose, registration.information, prior, FLOOR_SIGMA**2)
+            return planar, registration, judgement, False
+        self._rejected_in_row += 1
+        self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
+        if self._rejected_in_row >= FAILED_AFTER:
+            found = relocalise(self.walls, layer, guess, covariance, self._sigma_range_m)
+            if found is not None:
+                self._rejected_in_row = 0
+                return kalman.restart(planar, found.pose), found, judge(found, found.pose, covariance, len(layer)), True
+        return planar, registration, judgement, False
+
+    def _track_noise(self, scale: float) -> None:
+        """Learn the range noise from the residuals: fast at first, then slowly."""
+        rate = max(0.01, 0.3 / (1 + self._accepted / 5))
+        self._sigma_range_m = float(np.clip(self._sigma_range_m * scale**rate, 0.01, 0.5))
+
+    def _stand(
+        self,
+        history: AttitudeHistory,
+        planar: kalman.Planar,
+        vertical: kalman.Vertical,
+        registration: Registration | None,
+        z_shift: float,
+        z_sigma: float,
+    ) -> tuple[kalman.Planar, kalman.Vertical]:
+        """While nothing moves, the pose is the origin by definition; once it moves, the filter is let go."""
+        if registration is None:
+            return planar, vertical
+        noise = np.diag(np.linalg.inv(registration.information + np.diag([10.0, 10.0, 100.0])))
+        shift = np.append(registration.pose, z_shift)
+        if self._standstill.on_scan(history, shift, np.sqrt(np.append(noise, z_sigma**2))):
+            self._standing_scans += 1
+            return kalman.start(planar.t_ns), kalman.start_vertical(vertical.t_ns)
+        self._base_variance = noise / max(1, self._standing_scans)
+        del self._pending[-STANDING_DELAY:]
+        return kalman.let_go(planar), kalman.let_go_vertical(vertical)
+
+    def _after(
+        self,
+        old: Snapshot,
+        scan: LidarScan,
+        planar: kalman.Planar,
+        vertical: kalman.Vertical,
+        registration: Registration,
+        judgement: Judgement,
+        reset: bool,
+    ) -> Snapshot:
+        accepted = judgement.is_accepted
+        period_ns = self._cfg.odometry.keyframe_period_s * 1e9
+        scan_ns = 0.5e9 / self._cfg.lidar.rate_hz
+        due = scan.t_ns - self._keyframe_t_ns >= period_ns - scan_ns
+        climbed = abs(float(vertical.x[0]) - self._keyframe_z_m) > KEYFRAME_HEIGHT_M
+        is_keyframe = accepted and (due or climbed)
+        planar_map = registration.map_variance + self._base_variance if accepted else old.map_variance[:3]
+        ratio = registration.inliers / max(1.0, registration.inliers / max(registration.matched_ratio, 0.01))
+        quality = max(1, min(100, round(100 * ratio))) if accepted else old.quality
+        if self._rejected_in_row >= FAILED_AFTER:
+            quality = -1
+        return Snapshot(
+            t_scan_ns=scan.t_ns,
+            planar=planar,
+            vertical=vertical,
+            map_variance=np.append(planar_map, self.height.map_variance),
+            tilt_offset_rad=self.height.tilt_offset_rad,
+            tilt_variance=0.0,
+            quality=quality,
+            reset_counter=(old.reset_counter + 1) % 256 if reset else old.reset_counter,
+            converged=registration.converged and accepted,
+            is_degenerate=judgement.is_degenerate,
+            inliers=registration.inliers,
+            iterations=registration.iterations,
+            keyframe_id=old.keyframe_id + int(is_keyframe),
+            is_keyframe=is_keyframe,
+        )
+
+    def _close_keyframe(self, t_ns: int, z_m: float, *, is_first: bool) -> None:
+        """Put the waiting scans into the maps; while standing the newest wait on, since motion is noticed late."""
+        keep = STANDING_DELAY if self._standstill.is_standing and not is_first else 0
+        ready = self._pending[: len(self._pending) - keep]
+        self._pending = self._pending[len(self._pending) - keep :]
+        for waiting in ready:
+            r = rotation2(float(waiting.pose[2])).T
+            self.walls.insert(waiting.layer @ r + waiting.pose[:2], waiting.z_m, waiting.variance[:3])
+            ground = waiting.ground.copy()
+            ground[:, :2] = waiting.ground[:, :2] @ r + waiting.pose[:2]
+            ground[:, 2] += waiting.z_m
+            distance = np.hypot(waiting.ground[:, 0], waiting.ground[:, 1])
+            self.height.ground.insert(ground, distance, float(waiting.variance[3]))
+        self._keyframe_t_ns, self._keyframe_z_m = t_ns, z_m

@@ -1,0 +1,122 @@
+"""The map that scans are registered to: walls as lines in a grid, averaged over all that was seen of them.
+
+Nothing is forgotten and all scans weigh alike, so the walls seen first keep anchoring the pose and drift dies out;
+only sums from another height are capped, since a wall is not quite the same higher up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.messages import Array
+from companion.odometry import kernels
+
+MARGIN_CELLS = 64  # grown by at least this much at a time
+MAX_CELLS = 4_000_000  # 36 hectares at 0.3 m; points beyond are left out
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """What one registration gave. pose: x, y, yaw in map. information: (3, 3) of the points alone, inverse covariance.
+
+    scale: robust spread of the residuals over what the noise lets expect. matched_ratio: share of the points with a
+    wall to go to. map_variance: (3,) of the pose of the map itself where it was used.
+    """
+
+    pose: Array
+    information: Array
+    converged: bool
+    iterations: int
+    inliers: int
+    matched_ratio: float
+    scale: float
+    map_variance: Array
+
+
+class WallMap:
+    """Walls in the plane; lines are fitted to windows of 5 x 5 cells."""
+
+    def __init__(self, cell_m: float = 0.3) -> None:
+        self.cell_m = cell_m
+        self.origin = np.zeros(2)
+        self._allocate(0, 0)
+
+    def _allocate(self, ny: int, nx: int) -> None:
+        self.sums = np.zeros((ny, nx, kernels.SUMS))
+        self.spread = np.zeros((ny, nx, 2))
+        self.state = np.zeros((ny, nx), np.uint8)
+        self.lines = np.zeros((ny, nx, kernels.LINE))
+
+    @property
+    def is_empty(self) -> bool:
+        return self.state.size == 0
+
+    def insert(self, points_map: Array, z_m: float, variances: Array) -> None:
+        """Add (N, 2) points seen from height z_m, placed by a pose of those variances (x, y, yaw)."""
+        if len(points_map) == 0:
+            return
+        self._cover(points_map)
+        kernels.insert_points(
+            self.sums, self.spread, self.state, self.origin, self.cell_m, points_map, z_m, np.asarray(variances)
+        )
+
+    def register(
+        self,
+        points: Array,
+        guess: Array,
+        prior_information: Array,
+        *,
+        sigma_range_m: float,
+        sigma_surface_m: float = 0.02,
+        gate_m: float = 0.75,
+        max_iterations: int = 10,
+    ) -> Registration:
+        """Find x, y, yaw at which (N, 2) points in the levelled body frame lie on the walls.
+
+        prior_information: (3, 3) inverse covariance of the guess; holds the pose where the walls do not.
+        """
+        pose, information, out = kernels.register_to_lines(
+            self.sums,
+            self.spread,
+            self.state,
+            self.lines,
+            self.origin,
+            self.cell_m,
+            points,
+            np.asarray(guess, np.float64),
+            np.asarray(prior_information, np.float64),
+            sigma_range_m,
+            sigma_surface_m,
+            gate_m,
+            max_iterations,
+        )
+        return Registration(
+            pose=pose,
+            information=information,
+            converged=bool(out[1]),
+            iterations=int(out[0]),
+            inliers=int(out[3]),
+            matched_ratio=float(out[8]),
+            scale=float(out[4]),
+            map_variance=out[5:8],
+        )
+
+    def _cover(self, points: Array) -> None:
+        """Grow the grid, at most to MAX_CELLS, so that the points lie within."""
+        low = np.floor((points.min(axis=0) - self.origin) / self.cell_m).astype(np.int64)
+        high = np.floor((points.max(axis=0) - self.origin) / self.cell_m).astype(np.int64)
+        ny, nx = self.state.shape
+        if low[0] >= 0 and low[1] >= 0 and high[0] < nx and high[1] < ny:
+            return
+        before = np.where(low < 0, -low + MARGIN_CELLS, 0)
+        after = np.where(high >= (nx, ny), high - (nx, ny) + 1 + MARGIN_CELLS, 0)
+        new_nx, new_ny = int(nx + before[0] + after[0]), int(ny + before[1] + after[1])
+        if new_nx * new_ny > MAX_CELLS:
+            return
+        old = self.sums, self.spread
+        self._allocate(new_ny, new_nx)
+        part = np.s_[before[1] : before[1] + ny, before[0] : before[0] + nx]
+        self.sums[part], self.spread[part] = old
+        self.origin = self.origin - before * self.cell_m
