@@ -19,6 +19,7 @@ from simbridge.sensors import BaroSample, ImuSample
 from simbridge.sitl import SitlError
 from simbridge.sitl.json_physics import MOTORS, JsonPhysics, PhysicsState, ServoPacket
 from simbridge.sitl.px4 import Running
+from simbridge.sitl.rates import HeldRange
 from simbridge.sitl.truth import WORLD_TO_NED, Pose, PoseSource, q_ned_frd_wxyz
 
 Array = NDArray[np.float64]
@@ -48,6 +49,7 @@ class ArduPilotSitl:
         self._truth: PoseSource | None = None
         self._start_m: Array | None = None
         self._physics = JsonPhysics()
+        self._rangefinder = HeldRange()
         self._request: ServoPacket | None = None
         self._peer: tuple[str, int] | None = None
         self._was_connected = False
@@ -74,7 +76,7 @@ class ArduPilotSitl:
         baro is not used: the protocol has none, ArduPilot makes its own from the height.
         Raises: SitlError: ArduCopter never spoke, or has ended or been silent for connect_timeout_s.
         """
-        state = self._state(imu, rangefinder_m)
+        state = self._state(imu, self._rangefinder.update(t_ns, rangefinder_m))
         if self._request is None and not self._connect(state):
             return np.zeros(MOTORS)
         self._reply(self._physics.reply(state, self.step_ns * 1e-9))

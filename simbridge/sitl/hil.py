@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common as mavlink
 
 from simbridge.sensors import BaroSample, ImuSample
+from simbridge.sitl.rates import Beat, HeldRange
 
 Array = NDArray[np.float64]
 
@@ -53,9 +54,9 @@ class HilLink:
         self._rangefinder_limits_cm = (round(rangefinder_min_m * 100), round(rangefinder_max_m * 100))
         self._mav = mavlink.MAVLink(None, srcSystem=SYSTEM_ID, srcComponent=COMPONENT_ID)
         self._mav.robust_parsing = True
-        self._t_next_rangefinder_ns: int | None = None
-        self._t_next_heartbeat_ns: int | None = None
-        self._t_next_truth_ns: int | None = None
+        self._rangefinder = HeldRange()
+        self._rangefinder_beat = Beat(RANGEFINDER_PERIOD_NS)
+        self._heartbeat_beat = Beat(HEARTBEAT_PERIOD_NS)
         self.truth_period_ns: int | None = None
         self.heartbeats = 0
         self.dropped: Counter[str] = Counter()
@@ -72,16 +73,15 @@ class HilLink:
 
         Args:
             t_ns: simulated time since boot; becomes PX4's clock, in whole microseconds.
-            baro: None where it did not measure in this step. rangefinder_m: None where nothing came back.
+            baro, rangefinder_m: None where they did not measure in this step.
             mag_frd_gauss: (3,), or None for a vehicle without one.
         """
         frames = []
-        if self._t_next_heartbeat_ns is None or t_ns >= self._t_next_heartbeat_ns:
-            self._t_next_heartbeat_ns = t_ns + HEARTBEAT_PERIOD_NS
+        if self._heartbeat_beat.due(t_ns):
             frames.append(self._heartbeat())
-        if self._t_next_rangefinder_ns is None or t_ns >= self._t_next_rangefinder_ns:
-            self._t_next_rangefinder_ns = t_ns + RANGEFINDER_PERIOD_NS
-            frames.append(self._distance_sensor(t_ns, rangefinder_m))
+        held_m = self._rangefinder.update(t_ns, rangefinder_m)
+        if self._rangefinder_beat.due(t_ns):
+            frames.append(self._distance_sensor(t_ns, held_m))
         frames.append(self.hil_sensor(t_ns, imu, baro, mag_frd_gauss))
         return b"".join(frames)
 
