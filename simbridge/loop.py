@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from simbridge import footprint as fp
 from simbridge import kernels
 from simbridge.config import SimConfig, StartCircle
+from simbridge.faults import SensorFaults
 from simbridge.lidar import Lidar
 from simbridge.model import RAY_GROUPS
 from simbridge.sensors import STEP_NS, Barometer, BaroSample, Imu, ImuSample, Rangefinder
@@ -28,6 +29,7 @@ Array = NDArray[np.float64]
 BOOT_NS = 1_000_000_000
 CLEARANCE_PERIOD_NS = 40_000_000
 HARD_LANDING_MPS = 1.5  # PX4 lands at 0.7
+LIFTOFF_M = 0.3
 TOPPLED_COS = math.cos(math.radians(50.0))
 
 
@@ -61,27 +63,36 @@ class Simulation:
         self.min_clearance_m = math.inf
         self._autopilot = autopilot
         self._vehicle = Vehicle(self.world.model, self.world.surface, cfg.vehicle, cfg.world.wind, self.start, cfg.seed)
+        self._ground_z = float(self._vehicle.position[2])
         self._imu = Imu(cfg.vehicle.imu, cfg.seed)
         self._barometer = Barometer(cfg.vehicle.barometer, cfg.seed)
         self._rangefinder = Rangefinder(cfg.vehicle.rangefinder, cfg.seed)
         v = self._vehicle
         self._lidar = Lidar(self.world.model, v.data, v.body_id, cfg.lidar, cfg.seed, BOOT_NS)
+        self._faults = SensorFaults(cfg.faults, cfg.seed, BOOT_NS)
         self._packets: list[bytes] = []
 
     def step(self) -> None:
         """4 ms: what the sensors measured goes to the flight controller, its motor commands move the vehicle."""
         t_ns, vehicle = self.t_ns, self._vehicle
-        imu = self._imu.sample(vehicle.inertial_frd, vehicle.thrust_ratio)
-        baro = self._barometer.sample(t_ns, float(vehicle.position[2]))
+        faults = self._faults
+        imu = faults.imu(self._imu.sample(vehicle.inertial_frd, vehicle.thrust_ratio), t_ns)
+        baro = faults.baro(self._barometer.sample(t_ns, float(vehicle.position[2])), t_ns)
         rangefinder_m = None
         if self._rangefinder.is_due(t_ns):
             rangefinder_m = self._rangefinder.sample(self._distance_down())
+        rangefinder_m = faults.rangefinder(rangefinder_m, t_ns)
         controls = self._autopilot.step(t_ns, imu, baro, rangefinder_m)
         position, quat, velocity = vehicle.position.copy(), vehicle.q_world_body_wxyz.copy(), vehicle.motion[:3].copy()
         vehicle.step(controls)
         self.t_ns = t_ns + STEP_NS
         self._turn_lidar(position, quat)
         self._watch(velocity)
+
+    @property
+    def liftoff_ns(self) -> int | None:
+        """When the vehicle first left the ground: some faults count from there."""
+        return self._faults.liftoff_ns
 
     def take_lidar_packets(self) -> list[bytes]:
         """Packets sent since the last call, in order."""
@@ -115,11 +126,15 @@ class Simulation:
         quat = quat_before + v.q_world_body_wxyz  # neighbours in time: never near opposite signs
         quat /= math.sqrt(float(quat @ quat))
         t_ns = self.t_ns
-        self._packets += self._lidar.cast(t_ns - STEP_NS // 2, t_ns, middle, quat, v.motion[:3], v.motion[3:])
+        self._lidar.range_bias_m = self._faults.lidar_bias_m(t_ns)
+        packets = self._lidar.cast(t_ns - STEP_NS // 2, t_ns, middle, quat, v.motion[:3], v.motion[3:])
+        self._packets += self._faults.lidar(packets, t_ns)
 
     def _watch(self, velocity_before: Array) -> None:
-        """Collision and clearance."""
+        """Lift-off, collision and clearance."""
         vehicle = self._vehicle
+        if self._faults.liftoff_ns is None and float(vehicle.position[2]) > self._ground_z + LIFTOFF_M:
+            self._faults.liftoff_ns = self.t_ns
         if self.t_ns % CLEARANCE_PERIOD_NS < STEP_NS:
             clearance = self.world.clearance(vehicle.position) - fp.VEHICLE_RADIUS_M
             self.min_clearance_m = min(self.min_clearance_m, clearance)
