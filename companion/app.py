@@ -15,6 +15,8 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from companion.flight import Flight
 from companion.lidar.udp import LidarSocket, open_lidar
 from companion.mavlink.link import Link, open_link
@@ -25,6 +27,7 @@ SWITCH_INTERVAL_S = 0.001  # how long a thread may keep the interpreter from the
 SCAN_QUEUE = 2  # topics.SCAN.queue: a late scan is worth less than the next one
 MAP_QUEUE = 64
 AFTER_FINISH_S = 1.0
+ODOMETRY, SETPOINT = 331, 84  # message ids of MAVLink common
 
 
 @dataclass(slots=True)
@@ -36,9 +39,11 @@ class App:
     lidar: str
     on_sent: Callable[[int, bytes], None] | None = None  # the recorder's
     telemetry: Callable[[], Awaitable[None]] | None = None
+    housekeeping: Callable[[], Awaitable[None]] | None = None  # the recorder's: tells of a full disk
     scans_dropped: int = 0
     scans_unmapped: int = 0
     restarts: dict[str, int] = field(default_factory=dict)
+    _sent_ns: dict[int, list[int]] = field(default_factory=lambda: {ODOMETRY: [], SETPOINT: []})
     _scans: deque[LidarScan] = field(default_factory=lambda: deque(maxlen=SCAN_QUEUE))
     _scan_ready: asyncio.Event = field(default_factory=asyncio.Event)
     _to_map: deque[ScanResult] = field(default_factory=lambda: deque(maxlen=MAP_QUEUE))
@@ -58,16 +63,17 @@ class App:
         try:
             async with asyncio.TaskGroup() as tasks:
                 outer = [tasks.create_task(self.supervise("mapping", self._map), name="mapping")]
-                if self.telemetry is not None:
-                    outer.append(tasks.create_task(self.supervise("telemetry", self.telemetry), name="telemetry"))
+                for name, task in (("telemetry", self.telemetry), ("recorder", self.housekeeping)):
+                    if task is not None:
+                        outer.append(tasks.create_task(self.supervise(name, task), name=name))
                 inner = [
                     tasks.create_task(self._receive_mavlink(self._link), name="link"),
                     tasks.create_task(self._receive_lidar(lidar), name="lidar"),
                     tasks.create_task(self._odometry(), name="odometry"),
                 ]
                 await tasks.create_task(self._beat(), name="beat")
-                for task in (*inner, *outer):
-                    task.cancel()
+                for running in (*inner, *outer):
+                    running.cancel()
         finally:
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.remove_signal_handler(number)
@@ -149,5 +155,19 @@ class App:
         assert self._link is not None
         for frame in self.flight.take_output():
             self._link.send(frame)
+            now = time.monotonic_ns()
+            kept = self._sent_ns.get(int.from_bytes(frame[7:10], "little"))
+            if kept is not None:
+                kept.append(now)
             if self.on_sent is not None:
-                self.on_sent(time.monotonic_ns(), frame)
+                self.on_sent(now, frame)
+
+    def cadence(self) -> dict[str, dict[str, float]]:
+        """Measured intervals of what the flight controller needs steadily: median, 99th percentile, longest, in s."""
+        out: dict[str, dict[str, float]] = {}
+        for name, msg_id in (("odometry", ODOMETRY), ("setpoint", SETPOINT)):
+            interval = np.diff(np.array(self._sent_ns[msg_id], dtype=np.int64)) * 1e-9
+            if len(interval):
+                median, high = np.percentile(interval, [50, 99])
+                out[name] = {"median_s": float(median), "p99_s": float(high), "max_s": float(interval.max())}
+        return out

@@ -123,7 +123,7 @@ class Flight:
                 self.odometry.on_rangefinder(message)
                 self.tap(topics.RANGEFINDER, t_ns, message)
             elif isinstance(message, Event):
-                self._tell(message)
+                self.tell(message)
             elif isinstance(message, OperatorCommand):
                 self.on_operator(message)
 
@@ -171,7 +171,7 @@ class Flight:
     def tell_failure(self, t_ns: int, task: str, error: Exception) -> None:
         """A task of the outer ring failed: say so and go on."""
         text = f"{task} failed and is started again: {type(error).__name__}: {error}"
-        self._tell(Event(t_ns=t_ns, severity=Severity.WARNING, name=f"{task}_failed", text=text))
+        self.tell(Event(t_ns=t_ns, severity=Severity.WARNING, name=f"{task}_failed", text=text))
 
     # ---- out --------------------------------------------------------------------------------------------------------
 
@@ -216,7 +216,7 @@ class Flight:
             self.session.request(request)
             self.tap(topics.REQUEST, t_ns, request)
         for event in (*output.events, *verdict.events):
-            self._tell(event)
+            self.tell(event)
         if output.setpoint is not None:
             self.tap(topics.WANTED, t_ns, output.setpoint)
         setpoint = verdict.setpoint
@@ -234,12 +234,12 @@ class Flight:
             failed = estimate.quality < 0
             text = "Odometry lost: scans no longer fit the map" if failed else "Odometry is back"
             severity = Severity.CRITICAL if failed else Severity.NOTICE
-            self._tell(
+            self.tell(
                 Event(t_ns=t_ns, severity=severity, name="odometry_lost" if failed else "odometry_back", text=text)
             )
         if estimate.reset_counter != before.reset_counter:
             text = "Odometry found its place in the map again: the estimate jumps"
-            self._tell(Event(t_ns=t_ns, severity=Severity.WARNING, name="odometry_reset", text=text))
+            self.tell(Event(t_ns=t_ns, severity=Severity.WARNING, name="odometry_reset", text=text))
         if estimate.is_degenerate != before.is_degenerate:
             weak = estimate.is_degenerate
             text = (
@@ -248,7 +248,7 @@ class Flight:
                 else "Geometry holds in all axes again"
             )
             name = "degenerate" if weak else "no_longer_degenerate"
-            self._tell(Event(t_ns=t_ns, severity=Severity.WARNING if weak else Severity.INFO, name=name, text=text))
+            self.tell(Event(t_ns=t_ns, severity=Severity.WARNING if weak else Severity.INFO, name=name, text=text))
 
     def _belongs_in_map(self, estimate: OdometryEstimate) -> bool:
         if estimate.quality <= 0 or not estimate.converged:
@@ -260,7 +260,8 @@ class Flight:
             return True
         return False
 
-    def _tell(self, event: Event) -> None:
+    def tell(self, event: Event) -> None:
+        """Say it to whoever listens: ground station, recorder, telemetry."""
         self.events.append(event)
         self.session.send_event(event)
         self.tap(topics.EVENT, event.t_ns, event)

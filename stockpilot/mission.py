@@ -86,8 +86,12 @@ def build_mission(
     flies = {k: raw[k] for k in COMPANION_SECTIONS if raw.get(k) is not None}
     flies["lidar"] = {k: v for k, v in lidar.items() if k in LidarConfig.model_fields}
     companion = _validate(CompanionConfig, flies, raw, teller, problems)
+    if companion is not None:
+        problems += _companion_checks(companion, teller)
     sim: SimConfig | None = None
-    if raw.get("world") is not None:
+    if any(": lidar" in problem for problem in problems):
+        pass  # the emulated side would only say the same again
+    elif raw.get("world") is not None:
         emulated = {k: raw[k] for k in SIM_SECTIONS if raw.get(k) is not None}
         shared = companion.lidar.model_dump() if companion is not None else {}
         emulated["lidar"] = {
@@ -96,8 +100,8 @@ def build_mission(
         sim = _validate(SimConfig, emulated, raw, teller, problems)
     elif any(raw.get(k) is not None for k in ("vehicle", "faults")):
         problems.append(teller.say(("world",), None, "is missing: a vehicle or faults to emulate need a world"))
-    if companion is not None and not problems:
-        problems += _cross_checks(companion, sim, teller)
+    if companion is not None and sim is not None and not problems:
+        problems += _world_checks(companion, sim, teller)
     if problems or companion is None:
         raise ConfigError("\n".join(dict.fromkeys(problems)))
     return Mission(
@@ -106,7 +110,7 @@ def build_mission(
     )  # fmt: skip
 
 
-def _cross_checks(companion: CompanionConfig, sim: SimConfig | None, teller: _Teller) -> Iterator[str]:
+def _companion_checks(companion: CompanionConfig, teller: _Teller) -> Iterator[str]:
     nav, guard, lidar = companion.navigator, companion.guard, companion.lidar
     if lidar.min_range_m >= lidar.max_range_m:
         yield teller.say(
@@ -136,8 +140,10 @@ def _cross_checks(companion: CompanionConfig, sim: SimConfig | None, teller: _Te
             ("navigator", "forward_speed_mps"), nav.forward_speed_mps,
             f"must be at most guard.max_speed_mps {guard.max_speed_mps:g}",
         )  # fmt: skip
-    if sim is None:
-        return
+
+
+def _world_checks(companion: CompanionConfig, sim: SimConfig, teller: _Teller) -> Iterator[str]:
+    nav = companion.navigator
     if nav.height_m > sim.world.height_m - 1.5:
         yield teller.say(
             ("navigator", "height_m"), nav.height_m,
@@ -208,10 +214,7 @@ def _real_location(location: Location, raw: object) -> Location:
     here: object = raw
     for n, part in enumerate(location):
         last = n == len(location) - 1
-        if isinstance(here, dict) and part in here:
-            here = here[part]
-            out.append(part)
-        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+        if (isinstance(here, dict) and part in here) or (isinstance(here, list) and isinstance(part, int) and part < len(here)):
             here = here[part]
             out.append(part)
         elif last and not (isinstance(part, str) and ("[" in part or not isinstance(here, dict))):
@@ -318,9 +321,7 @@ def _apply_setting(raw: dict[str, Any], setting: str) -> None:
         else:
             raise ConfigError(f"--set {setting}: {_dotted(location[: n + 1])} is not in the mission")
     last = location[-1]
-    if isinstance(here, dict):
-        here[last] = value
-    elif isinstance(here, list) and isinstance(last, int) and last < len(here):
+    if isinstance(here, dict) or (isinstance(here, list) and isinstance(last, int) and last < len(here)):
         here[last] = value
     else:
         raise ConfigError(f"--set {setting}: {_dotted(location[:-1])} is not a section that has keys")

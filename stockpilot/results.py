@@ -24,7 +24,6 @@ from stockpilot.lockstep import Outcome
 from stockpilot.mission import Mission
 from stockpilot.score import MapPin, PoseScore, cramer_rao_bound_m, pin_map, score_poses, wall_distance_rms_m
 
-
 AT_HEIGHT_M = 0.5  # the paper's pipeline sees the scans this near to the mission's height
 
 

@@ -60,7 +60,9 @@ def load_sweep(path: Path) -> tuple[SweepFile, list[SweepRun]]:
         raise ConfigError(f"{path}: is not YAML: {error}") from None
     except ValidationError as error:
         allowed = ", ".join(SweepFile.model_fields)
-        faults = (f"{path}: {'.'.join(map(str, e['loc'])) or '(file)'}: {e['msg']}; keys: {allowed}" for e in error.errors())
+        faults = (
+            f"{path}: {'.'.join(map(str, e['loc'])) or '(file)'}: {e['msg']}; keys: {allowed}" for e in error.errors()
+        )
         raise ConfigError("\n".join(faults)) from None
     if not all(sweep.grid.values()):
         raise ConfigError(f"{path}: grid: each key needs at least one value")
@@ -117,11 +119,17 @@ def fly_run(run: SweepRun) -> dict[str, Any]:
 
 
 def sweep_command(
-    sweep_file: Annotated[Path, typer.Argument(help="sweep file (YAML), e.g. missions/paper_sweep.yaml", show_default=False)],
+    sweep_file: Annotated[
+        Path, typer.Argument(help="sweep file (YAML), e.g. missions/paper_sweep.yaml", show_default=False)
+    ],
     out: Annotated[Path | None, typer.Option(help="folder for results; default runs/<sweep>")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="tcp://HOST:8786 of a Dask scheduler; default: this machine")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="tcp://HOST:8786 of a Dask scheduler; default: this machine")
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="processes on this machine; default: one a core")] = None,
-    docs: Annotated[Path | None, typer.Option(help="fill this document's block of the sweep, e.g. docs/results.md")] = None,
+    docs: Annotated[
+        Path | None, typer.Option(help="fill this document's block of the sweep, e.g. docs/results.md")
+    ] = None,
     list_only: Annotated[bool, typer.Option("--list", help="name the flights, fly none")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON on stdout")] = False,
 ) -> None:
@@ -202,7 +210,10 @@ def _fly_all(
             memory_limit=0, silence_logs=40,
         )  # fmt: skip
     try:
-        with Client(cluster if cluster is not None else scheduler) as client, Progress(*columns, console=console) as bar:
+        with (
+            Client(cluster if cluster is not None else scheduler) as client,
+            Progress(*columns, console=console) as bar,
+        ):
             task = bar.add_task("flights", total=len(runs))
             futures = {client.submit(fly_run, run, key=run.name, pure=False, retries=2): run for run in runs}
             for future in as_completed(list(futures)):

@@ -24,7 +24,9 @@ def flat_row(result: Result) -> dict[str, Any]:
     """One row of the table: parameters, every key of the report, the paper's under paper_."""
     report = result["report"]
     row: dict[str, Any] = {"run": result["run"]}
-    row.update({f"set.{key}" if key != "mission" else "set.mission": _cell(v) for key, v in result["parameters"].items()})
+    row.update(
+        {f"set.{key}" if key != "mission" else "set.mission": _cell(v) for key, v in result["parameters"].items()}
+    )
     for key, value in report.items():
         if key == "paper":
             row.update({f"paper_{name}": item for name, item in value.items()})
@@ -116,7 +118,11 @@ def results_block(name: str, results: Sequence[Result], command: str) -> str:
     figures = summarise(results)
     lines = [f"`{command}`", "", "| figure | value |", "|---|---|"]
     lines += [f"| {key} | {_short(value)} |" for key, value in figures.items()]
-    lines += ["", "| by | flights | e_p median, m | e_p max, m | abs e_v median, % | abs e_v max, % | in interval | unsure | paper e_p, m |", "|---|---|---|---|---|---|---|---|---|"]  # noqa: E501
+    lines += [
+        "",
+        "| by | flights | e_p median, m | e_p max, m | abs e_v median, % | abs e_v max, % | in interval | unsure | paper e_p, m |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
     for label, group in _groups(results):
         reports = [r["report"] for r in group]
         paper = [r.get("paper") or {} for r in reports]
@@ -127,7 +133,11 @@ def results_block(name: str, results: Sequence[Result], command: str) -> str:
             sum(bool(r.get("warnings")) for r in reports), _median(_numbers(paper, "e_p_m")),
         ]  # fmt: skip
         lines.append("| " + " | ".join(_short(cell) for cell in cells) + " |")
-    lines += ["", "| pipeline | metric | rank correlation with the number of keyframes | rises with scans |", "|---|---|---|---|"]
+    lines += [
+        "",
+        "| pipeline | metric | rank correlation with the number of keyframes | rises with scans |",
+        "|---|---|---|---|",
+    ]
     for trend in trends(results):
         told = {True: "yes", False: "no", None: "cannot be told"}[trend["rises_with_scans"]]
         lines.append(f"| {trend['pipeline']} | {trend['metric']} | {_short(trend['rank_correlation'])} | {told} |")
@@ -174,7 +184,8 @@ def _groups(results: Sequence[Result]) -> list[tuple[str, list[Result]]]:
     groups: dict[str, list[Result]] = {}
     for result in results:
         label = ", ".join(
-            f"{key.split('.')[-1]} {value}" if key != "mission" else str(value) for key, value in result["parameters"].items()
+            f"{key.split('.')[-1]} {value}" if key != "mission" else str(value)
+            for key, value in result["parameters"].items()
         )
         groups.setdefault(label, []).append(result)
     return list(groups.items())
@@ -194,7 +205,10 @@ def _box_plots(results: Sequence[Result]) -> bytes:
     for axis, (key, title) in zip(axes, panels, strict=True):
         ours = [np.abs(_numbers([r["report"] for r in group], key)) for _, group in groups]
         paper = [np.abs(_numbers([r["report"].get("paper") or {} for r in group], key)) for _, group in groups]
-        for values, offset, colour, label in ((ours, -0.17, OURS, "stockpilot"), (paper, 0.17, PAPER, "the paper's method")):
+        for values, offset, colour, label in (
+            (ours, -0.17, OURS, "stockpilot"),
+            (paper, 0.17, PAPER, "the paper's method"),
+        ):
             if key == "keyframes" and offset > 0:
                 continue
             drawn = axis.boxplot(
@@ -269,7 +283,8 @@ def _page(
     )  # fmt: skip
     figures = "".join(f"<tr><td>{key}</td><td>{_short(v)}</td></tr>" for key, v in summarise(results).items())
     trend_rows = "".join(
-        f"<tr><td>{t['pipeline']}: {t['metric']}</td><td>{_short(t['rank_correlation'])}</td></tr>" for t in trends(results)
+        f"<tr><td>{t['pipeline']}: {t['metric']}</td><td>{_short(t['rank_correlation'])}</td></tr>"
+        for t in trends(results)
     )
     drawn = "".join(
         f"<figure>{_image(png, 'plan of ' + r['run'])}<figcaption>{html.escape(r['run'])}: e_p "

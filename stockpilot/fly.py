@@ -1,0 +1,184 @@
+"""`stockpilot fly`: the companion on real links, as on the vehicle."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from companion.app import App
+from companion.errors import FileFormatError
+from companion.flight import Flight
+from companion.mapping.export import save_point_map
+from companion.messages import Event, Severity, VolumeReport
+from companion.recording.log import Recorder
+from companion.topics import EVENT, Topic
+from stockpilot.leave import write_trajectory
+from stockpilot.mission import Mission, load_mission
+from stockpilot.recorded import listen, open_recorder
+from stockpilot.results import write_json
+
+RECORDER_PERIOD_S = 1.0
+STYLES = {Severity.WARNING: "yellow", Severity.NOTICE: "cyan", Severity.INFO: "dim", Severity.DEBUG: "dim"}
+
+
+def fly_command(
+    path: Path, *, connect: str, lidar: str, lidar_metadata: Path | None, out: Path | None, settings: list[str],
+    record: bool, as_json: bool,
+) -> int:  # fmt: skip
+    """Exit code: 0 completed, 1 not."""
+    mission = load_mission(path, settings)
+    metadata = _read_metadata(lidar_metadata)
+    folder = out or Path("runs") / f"{mission.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    folder.mkdir(parents=True, exist_ok=True)
+    console = Console(stderr=True)
+    flight = Flight(config=mission.companion, lidar_metadata_json=metadata)
+    recorder: Recorder | None = None
+    if record and mission.companion.recording.enabled:
+        recorder = open_recorder(folder, mission, lidar_metadata_json=metadata, autopilot="unknown", threaded=True)
+        listen(recorder, flight)
+    _tell_events(flight, console)
+    app = App(flight=flight, connect=connect, lidar=lidar, on_sent=recorder.output if recorder else None)
+    if recorder is not None:
+        app.housekeeping = _housekeeping(recorder, flight)
+    app.telemetry = _telemetry(mission, flight, folder)
+    began = time.monotonic()
+    try:
+        asyncio.run(
+            app.run(ready=lambda: console.print(f"listening on {connect} and {lidar}; Ctrl-C lands the vehicle"))
+        )
+    finally:
+        if recorder is not None:
+            recorder.close(_outcome(flight))
+    report = flight_report(mission, flight, app, time.monotonic() - began)
+    console.print("measuring ...", style="dim")
+    volume = flight.measure() if flight.mapper.size else None
+    report.update(volume_keys(volume))
+    _write(folder, flight, report)
+    if as_json:
+        typer.echo((folder / "report.json").read_text(encoding="utf-8").rstrip())
+    else:
+        from stockpilot.report import text_summary
+
+        Console().print(text_summary(report))
+        typer.echo(f"results in {folder}")
+    return 0 if report["state"] == "completed" else 1
+
+
+def flight_report(mission: Mission, flight: Flight, app: App, wall_time_s: float) -> dict[str, Any]:
+    """What is known of a flight without truth."""
+    navigation = flight.navigation
+    return {
+        "mission": mission.name,
+        "autopilot": flight.session.autopilot,
+        **_outcome(flight),
+        "forward_speed_mps": mission.companion.navigator.forward_speed_mps,
+        "scan_period_s": mission.companion.odometry.keyframe_period_s,
+        "wall_distance_m": mission.companion.navigator.wall_distance_m,
+        "height_m": mission.companion.navigator.height_m,
+        "wall_time_s": wall_time_s,
+        "scans": flight.scans,
+        "scans_dropped": app.scans_dropped,
+        "keyframes": len(flight.keyframes),
+        "lap_closed": bool(navigation is not None and navigation.lap_closed),
+        "odometry_max_gap_s": flight.odometry_max_gap_s,
+        "cadence": app.cadence(),
+        "lidar_dropped": dict(flight.decoder.dropped),
+        "events": [
+            {"t_s": (e.t_ns - flight.events[0].t_ns) * 1e-9, "severity": e.severity.name, "name": e.name, "text": e.text}
+            for e in flight.events
+        ],
+    }  # fmt: skip
+
+
+def volume_keys(volume: VolumeReport | None) -> dict[str, Any]:
+    """The report's keys that speak of the volume; None where nothing was mapped."""
+    return {
+        "volume_m3": volume.volume_m3 if volume else None,
+        "volume_interval_m3": list(volume.interval_m3) if volume else None,
+        "volume_interval_level": volume.interval_level if volume else None,
+        "seen_ratio": volume.seen_ratio if volume else None,
+        "interpolated_ratio": volume.interpolated_ratio if volume else None,
+        "unseen_ratio": volume.unseen_ratio if volume else None,
+        "warnings": list(volume.warnings) if volume else ["nothing was mapped"],
+    }
+
+
+def _outcome(flight: Flight) -> dict[str, str]:
+    navigation = flight.navigation
+    if navigation is None:
+        return {"state": "not started", "reason": "the flight controller was never heard"}
+    return {"state": navigation.outcome or navigation.state.value, "reason": navigation.reason}
+
+
+def _write(folder: Path, flight: Flight, report: dict[str, Any]) -> None:
+    from stockpilot.pictures import draw_map, draw_surface, draw_trajectory
+    from stockpilot.report import write_report_page
+
+    point_map = flight.mapper.point_map()
+    save_point_map(point_map, folder / "map.ply")
+    save_point_map(point_map, folder / "map.laz")
+    write_trajectory(folder / "trajectory.tum", flight.keyframes)
+    pictures: dict[str, Path] = {}
+    if len(point_map.points_map):
+        path = np.array([e.position_map_m for e in flight.keyframes], dtype=np.float64).reshape(-1, 3)
+        pictures["trajectory"] = draw_trajectory(
+            folder / "trajectory.png", outlines=[], pile_outlines=[], truth_world_m=None,
+            estimated_world_m=path[:, :2], paper_world_m=None, title=report["mission"],
+        )  # fmt: skip
+        pictures["map"] = draw_map(folder / "map.png", point_map)
+        pictures["surface"] = draw_surface(folder / "surface.png", flight.measure())
+    write_report_page(folder / "report.html", report, pictures)
+    write_json(folder / "report.json", report)
+
+
+def _read_metadata(path: Path | None) -> str | None:
+    if path is None:
+        return None
+    try:
+        text = path.read_text(encoding="utf-8")
+        json.loads(text)
+    except (OSError, ValueError) as error:
+        raise FileFormatError(
+            f"--lidar-metadata {path}: expected the sensor's metadata JSON (from its web page, or sim --metadata): {error}"
+        ) from None
+    return text
+
+
+def _tell_events(flight: Flight, console: Console) -> None:
+    """Events on the terminal too."""
+    inner = flight.tap
+
+    def tap(topic: Topic, t_ns: int, message: object) -> None:
+        inner(topic, t_ns, message)
+        if topic is EVENT and isinstance(message, Event):
+            console.print(
+                f"[{STYLES.get(message.severity, 'bold red')}]{message.severity.name.lower():8} {message.text}[/]"
+            )
+
+    flight.tap = tap
+
+
+def _housekeeping(recorder: Recorder, flight: Flight) -> Callable[[], Any]:
+    async def watch() -> None:
+        while True:
+            await asyncio.sleep(RECORDER_PERIOD_S)
+            for event in recorder.take_events(time.monotonic_ns()):
+                flight.tell(event)
+
+    return watch
+
+
+def _telemetry(mission: Mission, flight: Flight, folder: Path) -> Callable[[], Any] | None:
+    if mission.companion.telemetry.mqtt_url is None:
+        return None
+    from stockpilot.telemetry import mqtt_task
+
+    return mqtt_task(mission.companion.telemetry, flight, folder)

@@ -1,0 +1,129 @@
+"""Sweeps: a grid of named runs, skipped where they are done, put in one table and one page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from companion.errors import ConfigError
+from stockpilot.sweep import SweepRun, load_sweep, read_results
+from stockpilot.sweep_report import fill_document, flat_row, is_confident_and_wrong, summarise, trends, write_sweep_report
+
+MISSIONS = Path(__file__).resolve().parents[2] / "missions"
+SWEEPS = [MISSIONS / "paper_sweep.yaml", *sorted((MISSIONS / "sweeps").glob("*.yaml"))]
+
+
+@pytest.mark.parametrize("path", SWEEPS, ids=lambda p: p.stem)
+def test_shipped_sweep_is_valid_and_its_runs_have_names_of_their_own(path: Path) -> None:
+    _, runs = load_sweep(path)
+    assert len({run.name for run in runs}) == len(runs) > 0
+
+
+def test_the_papers_sweep_is_its_sixty_tests() -> None:
+    _, runs = load_sweep(MISSIONS / "paper_sweep.yaml")
+    assert len(runs) == 60
+    speeds = {dict(run.parameters)["navigator.forward_speed_mps"] for run in runs}
+    periods = {dict(run.parameters)["odometry.keyframe_period_s"] for run in runs}
+    assert speeds == {0.31, 0.43, 0.55}
+    assert periods == {1.6, 3.2, 4.8, 6.4}
+    assert {run.seed for run in runs} == {0, 1, 2, 3, 4}
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("missions: []", "missions"),
+        ("missions: [cement_store.yaml]\ngrit: {}", "grit"),
+        ("missions: [cement_store.yaml]\ngrid: {navigator.height_m: []}", "at least one value"),
+        ("missions: [cement_store.yaml]\ngrid: {navigator.hight_m: [5]}", "hight_m"),
+        ("missions: [nowhere.yaml]", "no such mission"),
+        ("missions: [", "not YAML"),
+    ],
+)
+def test_bad_sweep_is_refused_before_anything_flies(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "cement_store.yaml").write_text((MISSIONS / "cement_store.yaml").read_text(encoding="utf-8"))
+    path = tmp_path / "sweep.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as error:
+        load_sweep(path)
+    assert told in str(error.value)
+
+
+def result(name: str, *, speed: float, seed: int, e_p: float, e_v: float, keyframes: int, **more: Any) -> dict[str, Any]:
+    report = {
+        "state": "completed", "collision": False, "e_p_m": e_p, "e_v_percent": e_v, "keyframes": keyframes,
+        "c_c": 4 * keyframes, "volume_m3": 1000 + 10 * e_v, "truth_volume_m3": 1000.0, "truth_in_interval": True,
+        "volume_interval_m3": [980.0, 1020.0], "warnings": [], "events": [], "real_time_factor": 12.0,
+        "cramer_rao_bound_m": 0.011, "paper": {"e_p_m": 0.01 * keyframes, "e_v_percent": 5.0, "c_c": 50 * keyframes},
+    }  # fmt: skip
+    return {
+        "run": name, "parameters": {"mission": "cement_store", "navigator.forward_speed_mps": speed},
+        "report": {**report, **more}, "path_world_m": [[1.0, 1.0], [2.0, 3.0]],
+        "outlines_world_m": [[[0.0, 0.0], [50.0, 0.0], [50.0, 30.0], [0.0, 30.0]]],
+    }  # fmt: skip
+
+
+RESULTS = [
+    result(f"r{n}", speed=speed, seed=n, e_p=0.01 + 0.001 * n, e_v=0.1 * n - 0.2, keyframes=40 + 10 * n)
+    for n, speed in enumerate((0.31, 0.31, 0.43, 0.43, 0.55))
+]
+
+
+def test_table_holds_every_key_of_the_reports(tmp_path: Path) -> None:
+    write_sweep_report(tmp_path, "demo", "", RESULTS)
+    table = pd.read_parquet(tmp_path / "results.parquet")
+    assert len(table) == len(RESULTS)
+    assert {"e_p_m", "paper_e_p_m", "volume_interval_low_m3", "set.navigator.forward_speed_mps"} <= set(table.columns)
+    again = pd.read_csv(tmp_path / "results.csv")
+    assert list(again["e_p_m"]) == pytest.approx([r["report"]["e_p_m"] for r in RESULTS])
+
+
+def test_page_shows_both_pipelines_and_every_flight(tmp_path: Path) -> None:
+    page = write_sweep_report(tmp_path, "demo", "words", RESULTS).read_text(encoding="utf-8")
+    for r in RESULTS:
+        assert r["run"] in page
+    assert page.count("data:image/png;base64,") >= 2
+
+
+def test_a_wrong_volume_with_a_narrow_interval_is_counted() -> None:
+    unsure = result("u", speed=0.3, seed=0, e_p=0.1, e_v=9.0, keyframes=10, truth_in_interval=False, warnings=["dust"])
+    sure = result("s", speed=0.3, seed=0, e_p=0.1, e_v=9.0, keyframes=10, truth_in_interval=False)
+    assert not is_confident_and_wrong(unsure["report"])
+    assert is_confident_and_wrong(sure["report"])
+    assert summarise([*RESULTS, unsure, sure])["outside_without_warning"] == 1
+
+
+def test_trend_of_the_papers_pipeline_is_told_as_it_is() -> None:
+    told = {(t["pipeline"], t["metric"]): t["rises_with_scans"] for t in trends(RESULTS)}
+    assert told["paper", "e_p_m"] is True
+    assert told["paper", "e_v_percent"] is None  # the same error in every flight: nothing can be told
+
+
+def test_document_is_filled_between_its_markers_only(tmp_path: Path) -> None:
+    path = tmp_path / "results.md"
+    path.write_text("before\n<!-- sweep demo: begin -->\nSTALE-TABLE\n<!-- sweep demo: end -->\nafter\n", encoding="utf-8")
+    fill_document(path, "demo", RESULTS, command="stockpilot sweep demo.yaml")
+    text = path.read_text(encoding="utf-8")
+    assert text.startswith("before\n")
+    assert text.endswith("\nafter\n")
+    assert "STALE-TABLE" not in text
+    assert "stockpilot sweep demo.yaml" in text
+    with pytest.raises(ConfigError, match="expected the lines"):
+        fill_document(path, "other", RESULTS, command="x")
+
+
+def test_flight_that_is_there_is_skipped_and_half_a_file_is_flown_again(tmp_path: Path) -> None:
+    runs = [
+        SweepRun(name=n, mission="m", settings=(), parameters=(), seed=0, perfect_poses=False) for n in ("a", "b", "c")
+    ]
+    (tmp_path / "a.json").write_text(json.dumps({"report": {}}), encoding="utf-8")
+    (tmp_path / "b.json").write_text('{"report": {', encoding="utf-8")
+    assert set(read_results(tmp_path, runs)) == {"a"}
+
+
+def test_row_is_flat() -> None:
+    assert all(not isinstance(value, dict | list) for value in flat_row(RESULTS[0]).values())
