@@ -15,7 +15,14 @@ from companion.recording.mcap_write import Channel, Schema
 _RAW_SCHEMA = Schema(1, "stockpilot/Datagram", "ros1msg", b"string host\nuint16 port\nuint8[] data\n")
 _FOXGLOVE_FIRST = 2
 
-INPUTS = ("lidar", "mavlink", "poll", "accept", "operator", "begin")  # what goes into the flight core, in the order it went
+INPUTS = (
+    "lidar",
+    "mavlink",
+    "poll",
+    "accept",
+    "operator",
+    "begin",
+)  # what goes into the flight core, in the order it went
 INPUT_IDS = {kind: n + 1 for n, kind in enumerate(INPUTS)}
 OUTPUT_ID = 8
 POSE_ID, TRANSFORMS_ID, POINTS_ID, LOG_ID = 10, 11, 12, 13
