@@ -35,6 +35,7 @@ from companion.navigator.obstacles import Surroundings, allowed_speed
 SETPOINT_HOLD_NS = 300_000_000  # an older wish is no wish any more
 SETPOINT_SILENT_NS = 500_000_000
 LINK_LOST_NS = 3_000_000_000
+HEARTBEAT_NS = 1_000_000_000  # its period: age counts from when it was due
 ABORT_LAND_NS = 800_000_000  # the navigator asks sooner; this is for when it does not
 REQUEST_EVERY_NS = 1_000_000_000
 BREACH_M = 0.5  # beyond a limit by this: not a matter of clamping any more
@@ -145,7 +146,7 @@ class Guard:
         self._walls = walls
         if not stuck:  # range noise never repeats 360 values
             self._scan_ns = walls.t_ns
-            _, position, yaw = min(self._poses, key=lambda known: abs(known[0] - walls.t_ns))
+            _, position, yaw = _nearest_in_time(self._poses, walls.t_ns)
             self._surroundings.see(walls, float(position[0]), float(position[1]), yaw)
 
     def _height_m(self) -> float:
@@ -180,7 +181,7 @@ class Guard:
             return "vision is old"
         if inputs.estimate is not None and inputs.estimate.quality < 0:
             return "registration failed"
-        if t_ns - max(vehicle.t_ns, vehicle.t_heartbeat_ns) > cfg.max_state_age_s * 1e9:
+        if t_ns - vehicle.t_heartbeat_ns > cfg.max_state_age_s * 1e9 + HEARTBEAT_NS:
             return "the vehicle's state is old"
         if not (np.all(np.isfinite(setpoint.velocity_map_mps)) and math.isfinite(setpoint.yaw_rate_radps)):
             return "the setpoint is not a number"
@@ -272,6 +273,16 @@ class Guard:
         if why and why != self._told:
             events.append(Event(t_ns=t_ns, severity=severity, name=name, text=why))
         self._told = why
+
+
+def _nearest_in_time(poses: deque[tuple[int, Array, float]], t_ns: int) -> tuple[int, Array, float]:
+    """The pose nearest in time, looked for from the newest back."""
+    best = poses[-1]
+    for pose in reversed(poses):
+        if abs(pose[0] - t_ns) > abs(best[0] - t_ns):
+            break
+        best = pose
+    return best
 
 
 def _still(t_ns: int, kind: SetpointKind, reason: str) -> Setpoint:

@@ -7,7 +7,7 @@ from enum import Enum
 from companion.messages import FlightMode, RequestKind, VehicleState
 
 STREAM_FIRST_NS = 1_000_000_000  # PX4 wants the stream to be there; half its 2 Hz rule would do
-OFFBOARD_EVERY_NS = 1_000_000_000
+OFFBOARD_EVERY_NS = 2_000_000_000  # the mode shows in the heartbeat, once a second
 ARM_EVERY_NS = 2_000_000_000  # ArduPilot's estimators agree only after up to 24 s
 MAX_OFFBOARD_REQUESTS = 15
 MAX_ARM_REQUESTS = 20

@@ -45,7 +45,7 @@ READY_FOR_NS = 1_000_000_000  # ready and seeing for so long before arming
 VISION_BACK_NS = 1_000_000_000  # good again for so long before going on
 HOLD_AT_MOST_NS = 20_000_000_000  # on poor vision; then land here
 DEGENERATE_TURN_BACK_S = 20.0
-LAND_AGAIN_NS = 1_000_000_000
+LAND_AGAIN_NS = 2_000_000_000
 DISARM_AFTER_NS = 8_000_000_000  # on the ground in land mode and still armed
 LINK_LOST_NS = 3_000_000_000
 STUCK_NS = 45_000_000_000  # no place reached that is a metre away
@@ -153,7 +153,7 @@ class Navigator:
         if walls is not None and walls.t_ns > self._walls_t:
             self._walls_t = walls.t_ns
             self._view = ScanView.of(walls)
-            self._view_pose = min(self._poses, key=lambda known: abs(known[0] - walls.t_ns))[1]
+            self._view_pose = _pose_at(self._poses, walls.t_ns)
 
     @property
     def _height_m(self) -> float:
@@ -541,3 +541,13 @@ class Navigator:
             progress_ratio=min(1.0, progress), path_length_m=self._path.length_m,
             outcome=self._outcome if over else "", reason=self._reason,
         )  # fmt: skip
+
+
+def _pose_at(poses: deque[tuple[int, Pose2]], t_ns: int) -> Pose2:
+    """The pose nearest in time, looked for from the newest back."""
+    best = poses[-1]
+    for known in reversed(poses):
+        if abs(known[0] - t_ns) > abs(best[0] - t_ns):
+            break
+        best = known
+    return best[1]

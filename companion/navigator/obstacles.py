@@ -15,6 +15,7 @@ NEAR_REMEMBERED_NS = 500_000_000  # a near thing that vanishes may be nearer tha
 REACTION_S = 0.5  # age of the scan and the lag of the vehicle's velocity
 WAY_SECTORS = 12  # to each side of the motion: as wide as the vehicle at 2.5 m
 BLIND_SECTORS = 5  # so many in a row unknown in the way: something could hide there
+LONG_AGO_NS = -(10**15)
 MIN_SEEN = 18  # returns all round: with fewer nothing is seen at all
 
 
@@ -32,8 +33,8 @@ class Surroundings:
         self._stop = stop_distance_m
         self._deceleration = deceleration_mps2
         self._places = np.full((SECTORS, 2), np.inf)
-        self._place_ns = np.full(SECTORS, -1, dtype=np.int64)  # when the place was measured
-        self._looked_ns = np.full(SECTORS, -1, dtype=np.int64)  # when anybody looked there
+        self._place_ns = np.full(SECTORS, LONG_AGO_NS, dtype=np.int64)  # when the place was measured
+        self._looked_ns = np.full(SECTORS, LONG_AGO_NS, dtype=np.int64)  # when anybody looked there
 
     def see(self, walls: WallRanges, x: float, y: float, yaw: float) -> None:
         """Take in a scan and the pose it was taken at."""
@@ -49,6 +50,7 @@ class Surroundings:
         was_near = np.hypot(self._places[:, 0] - x, self._places[:, 1] - y) < self._stop + 0.5
         forgotten = free & ~(was_near & (walls.t_ns - self._place_ns < NEAR_REMEMBERED_NS))
         self._places[forgotten] = np.inf
+        self._place_ns[forgotten] = LONG_AGO_NS
         self._places[hit] = places[hit]
         self._place_ns[hit] = walls.t_ns
 
@@ -57,31 +59,26 @@ class Surroundings:
         speed = float(np.hypot(*velocity_xy))
         if speed < 1e-6:
             return np.zeros(2), ""
-        direction, distance = self._obstacles(x, y, t_ns)
-        if int(np.count_nonzero(np.isfinite(distance))) < MIN_SEEN:
+        fresh = t_ns - self._place_ns <= NEAR_REMEMBERED_NS
+        if int(np.count_nonzero(fresh)) < MIN_SEEN:
             return np.zeros(2), "nothing is seen"
-        limit = allowed_speed(distance - self._stop, self._deceleration)
-        near = limit < speed
-        direction, limit = direction[near], limit[near]
+        reach = self._stop + speed * REACTION_S + speed**2 / (2.0 * self._deceleration)
+        off = self._places - np.array([x, y])
+        distance = np.hypot(off[:, 0], off[:, 1])
+        near = fresh & (distance < reach)  # only what is so near can limit this speed
+        direction = off[near] / np.maximum(distance[near], 1e-9)[:, None]
+        limit = allowed_speed(distance[near] - self._stop, self._deceleration)
         velocity, why = _slide(velocity_xy, direction, limit)
         if float(np.hypot(*velocity)) > 1e-6 and self._is_blind(velocity, t_ns):
             return np.zeros(2), "nobody looked that way"
         return velocity, why
 
-    def _obstacles(self, x: float, y: float, t_ns: int) -> tuple[Array, Array]:
-        """Unit directions (360, 2) and distances (360,); inf where nothing is remembered."""
-        off = self._places - np.array([x, y])
-        fresh = np.isfinite(off[:, 0]) & (t_ns - self._place_ns <= max(REMEMBERED_NS, NEAR_REMEMBERED_NS))
-        off = np.where(fresh[:, None], off, 0.0)
-        distance = np.hypot(off[:, 0], off[:, 1])
-        direction = off / np.maximum(distance, 1e-9)[:, None]
-        return direction, np.where(fresh, distance, np.inf)
-
     def _is_blind(self, velocity: Array, t_ns: int) -> bool:
         centre = round(math.degrees(math.atan2(float(velocity[1]), float(velocity[0]))))
         way = np.arange(centre - WAY_SECTORS, centre + WAY_SECTORS + 1) % SECTORS
         unknown: NDArray[np.bool_] = t_ns - self._looked_ns[way] > REMEMBERED_NS
-        unknown |= self._looked_ns[way] < 0
+        if not unknown.any():
+            return False
         run = longest = 0
         for flag in unknown:
             run = run + 1 if flag else 0

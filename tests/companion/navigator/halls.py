@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 
 from companion.config import CompanionConfig
 from companion.geometry import quat_from_rpy, wrap_angle
@@ -19,7 +20,6 @@ from companion.messages import (
     OperatorCommand,
     RequestKind,
     Setpoint,
-    SetpointKind,
     VehicleRequest,
     VehicleState,
     WallRanges,
@@ -65,6 +65,23 @@ HALLS: dict[str, list[Ring]] = {
 }
 
 
+@njit(cache=True)
+def _cast(a: np.ndarray, edge: np.ndarray, x: float, y: float, bearing: np.ndarray) -> np.ndarray:
+    out = np.full(len(bearing), np.inf)
+    for n in range(len(bearing)):
+        dx, dy = math.cos(bearing[n]), math.sin(bearing[n])
+        for k in range(len(a)):
+            den = dx * edge[k, 1] - dy * edge[k, 0]
+            if abs(den) < 1e-12:
+                continue
+            ax, ay = a[k, 0] - x, a[k, 1] - y
+            along = (ax * edge[k, 1] - ay * edge[k, 0]) / den
+            share = (ax * dy - ay * dx) / den
+            if along > 0 and 0 <= share <= 1 and along < out[n]:
+                out[n] = along
+    return out
+
+
 class Hall:
     """Rings of straight edges: the first is the hall's outline, the others stand in it."""
 
@@ -75,15 +92,7 @@ class Hall:
         self.edge = self.b - self.a
 
     def cast(self, x: float, y: float, bearing: np.ndarray) -> np.ndarray:
-        dx, dy = np.cos(bearing)[:, None], np.sin(bearing)[:, None]
-        ax, ay = self.a[:, 0] - x, self.a[:, 1] - y
-        ex, ey = self.edge[:, 0], self.edge[:, 1]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            den = dx * ey - dy * ex
-            along = (ax * ey - ay * ex) / den
-            share = (ax * dy - ay * dx) / den
-            along = np.where((along > 0) & (share >= 0) & (share <= 1), along, np.inf)
-        return along.min(axis=1)
+        return _cast(self.a, self.edge, x, y, bearing)
 
     def clearance(self, x: float, y: float) -> float:
         p = np.array([x, y]) - self.a
