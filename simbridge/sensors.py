@@ -19,7 +19,6 @@ Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.81
 STEP_NS = 4_000_000
-STEPS_PER_S = 250
 
 # White noise density of each axis: accelerometer (x, y, z) in g/sqrt(Hz), gyro in deg/s/sqrt(Hz).
 # ICM-42688-P: TDK DS-000347 tables 1 and 2. BMI088: Bosch BST-BMI088-DS001 tables 2 and 3.
@@ -50,9 +49,9 @@ class BaroSample:
 class Imu:
     """Bias, misalignment, white noise and vibration on the true mean of a step."""
 
-    def __init__(self, cfg: ImuConfig, seed: int) -> None:
+    def __init__(self, cfg: ImuConfig, seed: int, step_ns: int = STEP_NS) -> None:
         accel_density, gyro_density = NOISE_DENSITY[cfg.part]
-        bandwidth = math.sqrt(STEPS_PER_S / 2.0)  # white noise averaged over a step
+        bandwidth = math.sqrt(0.5e9 / step_ns)  # white noise averaged over a step
         self._sigma = (
             np.array([*(d * GRAVITY_MPS2 for d in accel_density), *(math.radians(gyro_density),) * 3]) * bandwidth
         )
@@ -80,8 +79,8 @@ class Imu:
 class Barometer:
     """ISA pressure at a site, with white noise and a slow wander."""
 
-    def __init__(self, cfg: BarometerConfig, seed: int) -> None:
-        self._cfg = cfg
+    def __init__(self, cfg: BarometerConfig, seed: int, step_ns: int = STEP_NS) -> None:
+        self._cfg, self._step_ns = cfg, step_ns
         self._period_ns = 1_000_000_000 // cfg.rate_hz
         self._normals = Normals(stream(seed, "barometer"), 2)
         self._keep = math.exp(-1.0 / (cfg.rate_hz * cfg.drift_time_s))
@@ -89,7 +88,7 @@ class Barometer:
 
     def sample(self, t_ns: int, z_m: float) -> BaroSample | None:
         """None in steps without a measurement."""
-        if t_ns % self._period_ns >= STEP_NS:
+        if t_ns % self._period_ns >= self._step_ns:
             return None
         cfg, (white, slow) = self._cfg, self._normals.draw()
         self._drift_hpa = self._keep * self._drift_hpa + math.sqrt(1.0 - self._keep**2) * cfg.drift_hpa * float(slow)
@@ -102,13 +101,13 @@ class Barometer:
 class Rangefinder:
     """Distance along the body's -z axis, its mount already taken off, so from the body's origin."""
 
-    def __init__(self, cfg: RangefinderConfig, seed: int) -> None:
-        self._cfg = cfg
+    def __init__(self, cfg: RangefinderConfig, seed: int, step_ns: int = STEP_NS) -> None:
+        self._cfg, self._step_ns = cfg, step_ns
         self._period_ns = 1_000_000_000 // cfg.rate_hz
         self._normals = Normals(stream(seed, "rangefinder"), 1)
 
     def is_due(self, t_ns: int) -> bool:
-        return self._cfg.enabled and t_ns % self._period_ns < STEP_NS
+        return self._cfg.enabled and t_ns % self._period_ns < self._step_ns
 
     def sample(self, true_m: float) -> float | None:
         """true_m: negative where the ray meets nothing. None: nothing came back, or out of range."""

@@ -22,7 +22,7 @@ from simbridge.surface import Surface
 Array = NDArray[np.float64]
 
 GROUND_NEAR_M = 2.0  # the ground plane follows the vehicle only this near to the surface
-SETTLE_STEPS = 250
+SETTLE_S = 1.0
 
 
 class Vehicle:
@@ -39,8 +39,15 @@ class Vehicle:
         wind: Wind,
         start: tuple[float, float, float],
         seed: int,
+        step_s: float = STEP_S,
     ) -> None:
-        """start: x, y, yaw (rad) in `world`; the vehicle is set on the ground there and left to settle."""
+        """Set the vehicle on the ground and let it settle.
+
+        start: x, y, yaw (rad) in `world`. step_s: between motor commands; physics steps keep near the configured size.
+        """
+        self._step_s = step_s
+        self._substeps = max(1, round(cfg.substeps * step_s / STEP_S))
+        model.opt.timestep = step_s / self._substeps
         self.data = mujoco.MjData(model)
         self.body_id = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "vehicle"))
         self._model, self._surface, self._cfg = model, surface, cfg
@@ -52,22 +59,22 @@ class Vehicle:
         self._ground_pos, self._ground_quat = self.data.mocap_pos[0], self.data.mocap_quat[0]
         r, a = cfg.reaction_torque_m, cfg.arm_m
         self._sites = np.array([[a, -a, -r], [-a, a, -r], [a, a, r], [-a, -a, r]])
-        through = 1.0 - math.exp(-STEP_S / cfg.substeps / cfg.rotor_lag_s)
+        through = 1.0 - math.exp(-model.opt.timestep / cfg.rotor_lag_s)
         self._params = np.array([through, cfg.max_thrust_n, cfg.thrust_curve, cfg.drag_nspm])
         self._rotors = np.zeros(4)
-        self._draught = Draught(wind, seed)
+        self._draught = Draught(wind, seed, step_s)
         self.inertial_frd = np.zeros(6)
         self.thrust_ratio = 0.0
         self._place(start)
 
     def step(self, controls: Array) -> None:
-        """Fly 4 ms on these motor commands, (4,) 0..1 in motor order; not finite counts as 0."""
+        """Fly one step on these motor commands, (4,) 0..1 in motor order; not finite counts as 0."""
         commands = np.nan_to_num(np.asarray(controls, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
         wind = self._draught.step()
         self._move_ground()
         before_q, before_v = self.q_world_body_wxyz.copy(), self.motion.copy()
         thrust = 0.0
-        for _ in range(self._cfg.substeps):
+        for _ in range(self._substeps):
             thrust = rotors(
                 commands,
                 self._rotors,
@@ -80,7 +87,7 @@ class Vehicle:
             )
             mujoco.mj_step(self._model, self.data)
         self.thrust_ratio = thrust / (4.0 * self._cfg.max_thrust_n)
-        inertial(before_q, self.q_world_body_wxyz, before_v, self.motion, STEP_S, GRAVITY_MPS2, self.inertial_frd)
+        inertial(before_q, self.q_world_body_wxyz, before_v, self.motion, self._step_s, GRAVITY_MPS2, self.inertial_frd)
 
     @property
     def has_contact(self) -> bool:
@@ -103,7 +110,7 @@ class Vehicle:
         heading = np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
         mujoco.mju_mulQuat(self.q_world_body_wxyz, tilt, heading)
         self.position[:] = x, y, self._surface.height(x, y) - FOOT_Z_M
-        for _ in range(SETTLE_STEPS):
+        for _ in range(round(SETTLE_S / self._step_s)):
             self.step(np.zeros(4))
         self._rotors[:] = 0.0
 
@@ -121,15 +128,15 @@ class Vehicle:
 class Draught:
     """Mean wind plus gusts: a first-order Gauss-Markov process in each axis."""
 
-    def __init__(self, cfg: Wind, seed: int) -> None:
+    def __init__(self, cfg: Wind, seed: int, step_s: float) -> None:
         self._mean = np.array(cfg.mean_mps)
-        self._keep = math.exp(-STEP_S / cfg.gust_time_s)
+        self._keep = math.exp(-step_s / cfg.gust_time_s)
         self._kick = math.sqrt(1.0 - self._keep**2) * cfg.gust_mps * np.array([1.0, 1.0, 0.5])
         self._gust = np.zeros(3)
         self._normals = Normals(stream(seed, "wind"), 3) if cfg.gust_mps > 0.0 else None
 
     def step(self) -> Array:
-        """(3,) m/s in `world` for the next 4 ms."""
+        """(3,) m/s in `world` for the next step."""
         if self._normals is None:
             return self._mean
         self._gust = self._keep * self._gust + self._kick * self._normals.draw()
