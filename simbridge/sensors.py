@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.81
 STEP_NS = 4_000_000
+STEPS_PER_S = 250
 
 # White noise density of each axis: accelerometer (x, y, z) in g/sqrt(Hz), gyro in deg/s/sqrt(Hz).
 # ICM-42688-P: TDK DS-000347 tables 1 and 2. BMI088: Bosch BST-BMI088-DS001 tables 2 and 3.
