@@ -37,7 +37,8 @@ def _rotors(
 ) -> float:
     """Rotor lag, thrust law, reaction torque and drag: writes force and torque (6,) in `world`; total thrust, N.
 
-    commands, states: (4,) 0..1; states are updated. sites: (4, 3) x, y (FLU) and torque per thrust about body z.
+    commands, states: (4,) 0..1; states are updated; a command that is no number counts as 0.
+    sites: (4, 3) x, y (FLU) and torque per thrust about body z.
     params: share of the step that the lag lets through, Tmax, curve c, drag. T = Tmax ((1 - c) u + c u^2).
     """
     through, max_thrust, curve, drag = params[0], params[1], params[2], params[3]
@@ -46,7 +47,7 @@ def _rotors(
     ty = 0.0
     tz = 0.0
     for i in range(4):
-        command = min(max(commands[i], 0.0), 1.0)
+        command = min(commands[i], 1.0) if commands[i] > 0.0 else 0.0  # not a number: 0
         states[i] += through * (command - states[i])
         u = states[i]
         thrust = max_thrust * ((1.0 - curve) * u + curve * u * u)
@@ -81,11 +82,19 @@ def _inertial(q0: Array, q1: Array, v0: Array, v1: Array, step_s: float, gravity
 
 
 def _aim(
-    directions: Array, dt: Array, quat: Array, rate: Array, velocity: Array, lever: Array, rays: Array, shifts: Array
+    directions: Array,
+    t_first_s: float,
+    period_s: float,
+    quat: Array,
+    rate: Array,
+    velocity: Array,
+    lever: Array,
+    rays: Array,
+    shifts: Array,
 ) -> None:
     """World directions of some columns, each at its own time, and how far its origin is from the common one.
 
-    directions: (columns, rows, 3) in body. dt: (columns,) seconds from the common pose. rate: body. velocity: world.
+    directions: (columns, rows, 3) in body. t_first_s: of the first column, from the common pose. rate: body. velocity: world.
     lever: the beams' origin in body. rays: (columns * rows * 3,). shifts: (columns, 3).
     """
     r = np.empty((3, 3))
@@ -95,7 +104,7 @@ def _aim(
     lz = rate[0] * lever[1] - rate[1] * lever[0]
     n = 0
     for c in range(directions.shape[0]):
-        t = dt[c]
+        t = t_first_s + c * period_s
         for k in range(3):
             shifts[c, k] = t * (velocity[k] + r[k, 0] * lx + r[k, 1] * ly + r[k, 2] * lz)
         for i in range(directions.shape[1]):
@@ -167,11 +176,25 @@ def _returns(
             signal[row, first + c] = np.uint16(min(strength / max(0.04 * r * r, 0.25), 65535.0))
 
 
+def _triangle(z: Array, x0: float, y0: float, cell_m: float, x: float, y: float) -> tuple[float, float, float]:
+    """Height and rise per metre along x and y of the surface's triangle at a place; see `surface.py`."""
+    fx, fy = (x - x0) / cell_m, (y - y0) / cell_m
+    ix, iy = min(max(int(fx), 0), z.shape[1] - 2), min(max(int(fy), 0), z.shape[0] - 2)
+    u, v = min(max(fx - ix, 0.0), 1.0), min(max(fy - iy, 0.0), 1.0)
+    a, b = z[iy, ix], z[iy + 1, ix + 1]
+    if u >= v:
+        along, across = z[iy, ix + 1] - a, b - z[iy, ix + 1]
+    else:
+        along, across = b - z[iy + 1, ix], z[iy + 1, ix] - a
+    return a + u * along + v * across, along / cell_m, across / cell_m
+
+
 rotation = njit(cache=True)(_rotation)
 rotors = njit(cache=True)(_rotors)
 inertial = njit(cache=True)(_inertial)
 aim = njit(cache=True)(_aim)
 returns = njit(cache=True)(_returns)
+triangle = njit(cache=True)(_triangle)
 
 
 def warm_up() -> None:
@@ -179,7 +202,8 @@ def warm_up() -> None:
     q, v, z3 = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(3)
     rotors(np.zeros(4), np.zeros(4), np.zeros((4, 3)), q, v, z3, np.zeros(4), np.zeros(6))
     inertial(q, q, v, v, 0.004, 9.81, np.zeros(6))
-    aim(np.ones((1, 1, 3)), np.zeros(1), q, z3, z3, z3, np.zeros(3), np.zeros((1, 3)))
+    aim(np.ones((1, 1, 3)), 0.0, 0.0, q, z3, z3, z3, np.zeros(3), np.zeros((1, 3)))
+    triangle(np.zeros((2, 2)), 0.0, 0.0, 1.0, 0.0, 0.0)
     returns(
         np.ones(1), np.ones(3), np.ones(3), np.zeros((1, 3)), np.zeros((1, 1)), np.zeros((1, 1, 3)), np.zeros(8),
         np.zeros(1, dtype=np.int64), 0, np.zeros((1, 16), dtype=np.uint32), np.zeros((1, 16), dtype=np.uint16),

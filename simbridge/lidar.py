@@ -13,7 +13,7 @@ from simbridge.kernels import aim, returns
 from simbridge.model import RAY_GROUPS
 from simbridge.ouster import COLUMNS_PER_PACKET, SENSOR_ABOVE_BASE_M, PacketWriter, directions_sensor, sensor_info
 from simbridge.rotation import matrix_from_rpy
-from simbridge.sensors import STEPS_PER_S
+from simbridge.sensors import STEP_NS
 from simbridge.streams import stream
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class Lidar:
         self._noise = np.zeros((cfg.columns, len(self._rows)))
         self._chance = np.zeros((cfg.columns, len(self._rows), 3))
         self._params = _parameters(cfg)
-        most = self._per_s // STEPS_PER_S + 2
+        most = self._per_s * STEP_NS // NS + 2  # columns of the longest step
         self._shifts = np.zeros((most, 3))
         self._rays, self._normals = np.zeros(3 * most * len(self._rows)), np.zeros(3 * most * len(self._rows))
         self._distance = np.zeros(most * len(self._rows))
@@ -93,9 +93,19 @@ class Lidar:
         self, first: int, count: int, t_pose_ns: int, position: Array, quat: Array, velocity: Array, rate: Array
     ) -> None:
         """One mj_multiRay for the columns of a step, all from the pose's origin, each in its own direction."""
-        dt = np.multiply(self._t_ns(np.arange(first, first + count)) - t_pose_ns, 1e-9, dtype=np.float64)
         start = first % self._columns
-        aim(self._directions[start : start + count], dt, quat, rate, velocity, self._lever, self._rays, self._shifts)
+        t_first_s = (self._began_ns + first * NS // self._per_s - t_pose_ns) * 1e-9
+        aim(
+            self._directions[start : start + count],
+            t_first_s,
+            1.0 / self._per_s,
+            quat,
+            rate,
+            velocity,
+            self._lever,
+            self._rays,
+            self._shifts,
+        )
         origin = np.empty(3)
         mujoco.mju_rotVecQuat(origin, self._lever, quat)
         origin += position

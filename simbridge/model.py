@@ -116,6 +116,7 @@ def _add_vehicle(spec: Any, vehicle: VehicleConfig) -> None:
 
 def tilt_wxyz(slope_x: float, slope_y: float) -> list[float]:
     """Shortest rotation that takes z to the normal of a plane rising by these ratios."""
-    n = np.array([-slope_x, -slope_y, 1.0]) / math.sqrt(slope_x**2 + slope_y**2 + 1.0)
-    q = np.array([1.0 + n[2], -n[1], n[0], 0.0])
-    return [float(v) for v in q / math.sqrt(float(q @ q))]
+    length = math.sqrt(slope_x**2 + slope_y**2 + 1.0)
+    w, x, y = 1.0 + 1.0 / length, slope_y / length, -slope_x / length
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y)
+    return [w * scale, x * scale, y * scale, 0.0]

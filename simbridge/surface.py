@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from simbridge import footprint as fp
 from simbridge import piles
 from simbridge.config import WorldConfig
+from simbridge.kernels import triangle
 
 Array = NDArray[np.float64]
 
@@ -34,29 +35,18 @@ class Surface:
 
     def height(self, x: float, y: float) -> float:
         """Top of material or floor at a place; the grid's edge counts on beyond it."""
-        ix, iy, u, v = self._cell(x, y)
-        a, b = float(self.z[iy, ix]), float(self.z[iy + 1, ix + 1])
-        if u >= v:
-            corner = float(self.z[iy, ix + 1])
-            return a + u * (corner - a) + v * (b - corner)
-        corner = float(self.z[iy + 1, ix])
-        return a + v * (corner - a) + u * (b - corner)
+        return float(triangle(self.z, self.x0, self.y0, self.cell_m, x, y)[0])
+
+    def plane(self, x: float, y: float) -> tuple[float, float, float]:
+        """Height, and rise per metre along x and y, of the triangle at a place."""
+        height, slope_x, slope_y = triangle(self.z, self.x0, self.y0, self.cell_m, x, y)
+        return float(height), float(slope_x), float(slope_y)
 
     def bare_height(self, x: float, y: float) -> float:
         """The floor alone at a place (it is a plane)."""
         fx, fy = (x - self.x0) / self.cell_m, (y - self.y0) / self.cell_m
         f = self.floor
         return float(f[0, 0] + fx * (f[0, 1] - f[0, 0]) + fy * (f[1, 0] - f[0, 0]))
-
-    def slope(self, x: float, y: float) -> tuple[float, float]:
-        """Rise per metre along x and y of the triangle at a place."""
-        ix, iy, u, v = self._cell(x, y)
-        a, b = float(self.z[iy, ix]), float(self.z[iy + 1, ix + 1])
-        if u >= v:
-            corner = float(self.z[iy, ix + 1])
-            return (corner - a) / self.cell_m, (b - corner) / self.cell_m
-        corner = float(self.z[iy + 1, ix])
-        return (b - corner) / self.cell_m, (corner - a) / self.cell_m
 
     def cells_with_material(self) -> NDArray[np.bool_]:
         """(ny - 1, nx - 1): any of the four corners carries material."""
@@ -82,12 +72,6 @@ class Surface:
         x, y = self.x0 + ix * self.cell_m, self.y0 + iy * self.cell_m
         cells = shapely.box(x, y, x + self.cell_m, y + self.cell_m)
         return shapely.union_all(cells).intersection(hall)
-
-    def _cell(self, x: float, y: float) -> tuple[int, int, float, float]:
-        fx, fy = (x - self.x0) / self.cell_m, (y - self.y0) / self.cell_m
-        ny, nx = self.z.shape
-        ix, iy = min(max(int(fx), 0), nx - 2), min(max(int(fy), 0), ny - 2)
-        return ix, iy, min(max(fx - ix, 0.0), 1.0), min(max(fy - iy, 0.0), 1.0)
 
 
 def build_surface(world: WorldConfig) -> Surface:

@@ -21,7 +21,7 @@ from simbridge.surface import Surface
 
 Array = NDArray[np.float64]
 
-GROUND_NEAR_M = 2.0  # the ground plane follows the vehicle only this near to the surface
+GROUND_NEAR_M = 2.0  # the ground plane follows the vehicle only this near to the highest surface
 SETTLE_S = 1.0
 
 
@@ -55,6 +55,7 @@ class Vehicle:
         self.position: Array = self.data.qpos[0:3]
         self.q_world_body_wxyz: Array = self.data.qpos[3:7]
         self.motion: Array = self.data.qvel  # velocity in world, turn rate in body
+        self._near_below_z = float(surface.z.max()) + GROUND_NEAR_M
         self._wrench: Array = self.data.xfrc_applied[self.body_id]
         self._ground_pos, self._ground_quat = self.data.mocap_pos[0], self.data.mocap_quat[0]
         r, a = cfg.reaction_torque_m, cfg.arm_m
@@ -68,8 +69,8 @@ class Vehicle:
         self._place(start)
 
     def step(self, controls: Array) -> None:
-        """Fly one step on these motor commands, (4,) 0..1 in motor order; not finite counts as 0."""
-        commands = np.nan_to_num(np.asarray(controls, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+        """Fly one step on these motor commands, (4,) 0..1 in motor order; what is no number counts as 0."""
+        commands = np.asarray(controls, dtype=np.float64)
         wind = self._draught.step()
         self._move_ground()
         before_q, before_v = self.q_world_body_wxyz.copy(), self.motion.copy()
@@ -106,10 +107,11 @@ class Vehicle:
 
     def _place(self, start: tuple[float, float, float]) -> None:
         x, y, yaw = start
-        tilt = np.array(tilt_wxyz(*self._surface.slope(x, y)))
+        height, slope_x, slope_y = self._surface.plane(x, y)
+        tilt = np.array(tilt_wxyz(slope_x, slope_y))
         heading = np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
         mujoco.mju_mulQuat(self.q_world_body_wxyz, tilt, heading)
-        self.position[:] = x, y, self._surface.height(x, y) - FOOT_Z_M
+        self.position[:] = x, y, height - FOOT_Z_M
         for _ in range(round(SETTLE_S / self._step_s)):
             self.step(np.zeros(4))
         self._rotors[:] = 0.0
@@ -117,12 +119,12 @@ class Vehicle:
     def _move_ground(self) -> None:
         """Lay the ground plane under the vehicle, tilted like the surface there."""
         x, y, z = self.position.tolist()
-        height = self._surface.height(x, y)
-        if z - height > GROUND_NEAR_M:
+        if z > self._near_below_z:
             self._ground_pos[2] = -100.0
             return
+        height, slope_x, slope_y = self._surface.plane(x, y)
         self._ground_pos[:] = x, y, height
-        self._ground_quat[:] = tilt_wxyz(*self._surface.slope(x, y))
+        self._ground_quat[:] = tilt_wxyz(slope_x, slope_y)
 
 
 class Draught:
