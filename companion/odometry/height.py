@@ -20,8 +20,9 @@ Z_FLOOR_SIGMA_M = 0.004
 GATE_SIGMAS = 5.0
 MIN_GATE_M = 0.1
 MIN_GROUND_POINTS = 20
-TILT_WALK = 0.001  # rad per sqrt(s): how fast the attitude's error wanders
+TILT_WALK = 0.0015  # rad per sqrt(s): how fast the attitude's error wanders
 TILT_SIGMA_RAD = 0.01  # how large it is thought to be
+TILT_FLOOR_RAD = 0.0002
 MAX_TILT_RAD = math.radians(4.0)
 MAX_REJECTED = 10
 
@@ -82,9 +83,10 @@ class HeightTracker:
             pose,
             float(vertical.x[0]),
             walls,
-            sigma_range_m=sigma_m,
+            sigma_range_m=0.5 * sigma_m,  # means of blocks of about four returns
             gate_m=0.5 + 3.0 * sigma_z,
             seen_spread_m=self._highest_m,
+            tilt_information=np.asarray(np.linalg.inv(self._tilt_p), np.float64),
         )
 
     def update(
@@ -98,15 +100,14 @@ class HeightTracker:
     ) -> tuple[kalman.Vertical, HeightResult]:
         """Vertical state after this scan. lower: (N, 3) levelled points of the layers below the horizontal one."""
         vertical = self._use_rangefinder(vertical, pose, history)
-        fit = self.fit(lower, pose, vertical, walls, sigma_m)
-        self._highest_m = max(self._highest_m, float(vertical.x[0]))
         dt_s = max(0.0, (vertical.t_ns - self._t_ns) * 1e-9) if self._t_ns else 0.0
         self._t_ns = vertical.t_ns
+        self._tilt_p = self._tilt_p + np.eye(2) * TILT_WALK**2 * dt_s
+        fit = self.fit(lower, pose, vertical, walls, sigma_m)
+        self._highest_m = max(self._highest_m, float(vertical.x[0]))
         sigma_z = math.inf
         if fit.ground_points >= MIN_GROUND_POINTS:
-            prior = np.diag([1e-3, 1.0 / 0.005**2, 1.0 / 0.005**2])
-            covariance = np.linalg.inv(fit.information + prior)
-            sigma_z = math.sqrt(float(covariance[0, 0]) + Z_FLOOR_SIGMA_M**2)
+            sigma_z = math.sqrt(1.0 / (float(fit.information[0, 0]) + 1e-3) + Z_FLOOR_SIGMA_M**2)
             gate = max(MIN_GATE_M, GATE_SIGMAS * math.hypot(math.sqrt(float(vertical.p[0, 0])), sigma_z))
             if abs(fit.correction[0]) < gate or self._rejected >= MAX_REJECTED:
                 vertical = kalman.update_vertical(vertical, float(vertical.x[0] + fit.correction[0]), sigma_z**2)
@@ -114,24 +115,18 @@ class HeightTracker:
                 self._rejected = 0
             else:
                 self._rejected += 1
-        if fit.wall_points >= MIN_GROUND_POINTS:
-            self._track_tilt(fit, dt_s)
+        self._track_tilt(fit, dt_s)
         ground = fit.new_ground
         result = HeightResult(fit.correction, sigma_z, ground, fit.ground_points, fit.wall_points)
         return vertical, result
 
     def _track_tilt(self, fit: HeightFit, dt_s: float) -> None:
-        """A random walk that is drawn back to 0, measured by the points on walls and ground."""
-        information = np.linalg.inv(np.linalg.inv(fit.information + np.diag([1e-3, 1e2, 1e2]))[1:, 1:])
-        prior = 1.0 / 0.005**2
+        """Take over what the walls told of the tilt, beside a random walk that is drawn back to 0."""
         back = min(1.0, dt_s * (TILT_WALK / TILT_SIGMA_RAD) ** 2 / 2)
-        self._tilt = self._tilt * (1.0 - back)
-        p = self._tilt_p * (1.0 - back) ** 2 + np.eye(2) * TILT_WALK**2 * dt_s
-        ml = np.linalg.solve(information, (information + np.eye(2) * prior) @ fit.correction[1:])
-        noise = np.linalg.inv(information) + np.eye(2) * 0.0005**2
-        gain = p @ np.linalg.inv(p + noise)
-        self._tilt = np.clip(self._tilt + gain @ ml, -MAX_TILT_RAD, MAX_TILT_RAD)
-        self._tilt_p = p - gain @ p
+        tilt = (self._tilt + fit.correction[1:]) * (1.0 - back)
+        self._tilt = np.clip(tilt, -MAX_TILT_RAD, MAX_TILT_RAD)
+        self._tilt_p = np.asarray(np.linalg.inv(np.linalg.inv(self._tilt_p) + fit.information[1:, 1:]), np.float64)
+        self._tilt_p += np.eye(2) * TILT_FLOOR_RAD**2
 
     def _use_rangefinder(self, vertical: kalman.Vertical, pose: Array, history: AttitudeHistory) -> kalman.Vertical:
         """Above the start the reading, made plumb, is the height: the floor there is known from standing on it."""

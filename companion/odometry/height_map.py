@@ -17,12 +17,12 @@ from companion.odometry import height_kernels as hk
 from companion.odometry.wall_map import MARGIN_CELLS, MAX_CELLS, WallMap
 
 MAX_POINTS = 3072  # of a scan; more are thinned evenly
-TILT_PRIOR_RAD = 0.005
+BEND_SIGMA_RAD = 0.0017  # slope that the ground's map may have gained while it was built
 
 
 @dataclass(frozen=True, slots=True)
 class HeightFit:
-    """Errors of the guess: z, roll, pitch; information (3, 3) of the points alone; counts; scale of the residuals."""
+    """Errors of the guess: z, roll, pitch. information: (3, 3), of z by the ground, of roll and pitch by the walls."""
 
     correction: Array
     information: Array
@@ -56,10 +56,12 @@ class HeightMap:
         sigma_range_m: float,
         gate_m: float,
         seen_spread_m: float,
+        tilt_information: Array,
     ) -> HeightFit:
         """Match (N, 3) levelled points of the lower layers at pose (x, y, yaw) and height z_m.
 
         gate_m: how far a point may be off the known ground. seen_spread_m: range of heights flown through so far.
+        tilt_information: (2, 2) of roll and pitch as they were used for levelling.
         """
         if len(points_level) > MAX_POINTS:
             points_level = points_level[:: -(-len(points_level) // MAX_POINTS)]
@@ -87,7 +89,6 @@ class HeightMap:
             kind,
             place,
         )
-        tilt = 1.0 / TILT_PRIOR_RAD**2
         correction, information, out = hk.fit_height(
             self.planes,
             walls.lines,
@@ -97,7 +98,8 @@ class HeightMap:
             kind,
             place,
             sigma_range_m,
-            np.array([1e-3, tilt, tilt]),
+            tilt_information,
+            BEND_SIGMA_RAD**2,
             4,
         )
         return HeightFit(
