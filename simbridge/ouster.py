@@ -43,6 +43,7 @@ def sensor_info(cfg: LidarSimConfig) -> Any:
     info.format.pixel_shift_by_row = [0] * cfg.rows
     info.format.columns_per_packet = COLUMNS_PER_PACKET
     info.format.udp_profile_lidar = core.UDPProfileLidar.RNG19_RFL8_SIG16_NIR16
+    info.config.udp_port_lidar, info.config.udp_port_imu = 7502, 7503  # without a port the SDK reads the profile as OFF
     return info
 
 
