@@ -45,16 +45,16 @@ def error_budget(e: Evidence) -> dict[str, float]:
     """1 sigma of each part, m3."""
     area = e.grid.cell_area_m2 * e.share * e.pile
     pile_area = float(area.sum())
-    flank_x, flank_y = _flanks(e, area)
-    flank = math.hypot(flank_x, flank_y)
+    flanks = _flanks(e, area)
+    flank = math.sqrt(sum(f * f for f in flanks))
     gaps, hidden = _interpolation(e, area)
     return {
         "returns": _sampling(e, area),
         "position": e.position_sigma_m * flank / math.sqrt(POSE_SIDES),
         "height": e.height_sigma_m * pile_area / POSE_SIDES,
-        "range": RANGE_BIAS_SIGMA_M * (0.3 * pile_area + flank_x + flank_y),
+        "range": RANGE_BIAS_SIGMA_M * (0.3 * pile_area + 0.7 * sum(flanks)),
         "floor": _floor(e, area),
-        "walls": e.wall_sigma_m * _contact(e),
+        "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _contact(e),
         "interpolated": gaps,
         "unseen": hidden,
         "obstacles": _obstacles(e),
@@ -72,10 +72,12 @@ def _sampling(e: Evidence, area: Array) -> float:
     return math.sqrt(float(np.sum((area * sigma) ** 2)))
 
 
-def _flanks(e: Evidence, area: Array) -> tuple[float, float]:
-    """Area of the pile's flanks as seen along x and along y: how much volume a metre of disagreement moves."""
-    gx, gy = np.abs(e.surface.slope_x) * area, np.abs(e.surface.slope_y) * area
-    return float(gx.sum()) / math.sqrt(2.0), float(gy.sum()) / math.sqrt(2.0)
+def _flanks(e: Evidence, area: Array) -> tuple[float, float, float, float]:
+    """Area of the pile's flanks as seen from +x, -x, +y, -y: the volume that a metre of error there moves."""
+    gx, gy = e.surface.slope_x * area, e.surface.slope_y * area
+    sides = (np.maximum(gx, 0), np.maximum(-gx, 0), np.maximum(gy, 0), np.maximum(-gy, 0))
+    a, b, c, d = (float(side.sum()) for side in sides)
+    return a, b, c, d
 
 
 def _floor(e: Evidence, area: Array) -> float:

@@ -5,8 +5,9 @@ linearly (`griddata`), and the double integral of that surface (eq. 6). It leave
 
 - R. Section 4 says that the estimate always exceeds the truth "because of the walls and the ground that need to be
   excluded from M", and an error of 3 % cannot be had with the walls inside R (they alone add more than half of the
-  pile). So R is the rectangle about the map (the paper's hall is one), drawn in by a hand-set band that keeps the walls out
-  while poses are good; where drift doubles the walls they come into R, and the volume grows, as the paper reports.
+  pile). So R is the rectangle about the map (the paper's hall is one), drawn in by a hand-set band that keeps the
+  walls out while poses are good; where drift doubles the walls they come into R, and the volume grows, as the paper
+  reports.
 - The zero of z. The paper's z counts from the ground, ours from where odometry began: `ground_z_m` moves it. Of the
   ground nothing else is taken away: its returns stay in M, with their noise.
 """
@@ -51,8 +52,10 @@ def paper_volume(
     z = points[:, 2] - (_ground(points[:, 2]) if ground_z_m is None else ground_z_m)
     place = (points[:, :2] - corner) @ axes.T
     # griddata wants one height for a place: MATLAB's takes the mean of points at the same place, and so do we.
-    node, of_node = np.unique(np.round(place / 0.01).astype(np.int64), axis=0, return_inverse=True)
-    height = np.bincount(of_node.ravel(), z) / np.bincount(of_node.ravel())
+    cm = np.round(place / 0.01).astype(np.int64)
+    key, of_node = np.unique((cm[:, 0] << 32) | (cm[:, 1] & 0xFFFFFFFF), return_inverse=True)
+    height = np.bincount(of_node, z) / np.bincount(of_node)
+    node = np.column_stack([key >> 32, key & 0xFFFFFFFF])
     x, y = np.meshgrid(*(np.arange(wall_band_m + cell_m / 2, side - wall_band_m, cell_m) for side in size))
     if x.size == 0:
         return float("nan")

@@ -20,6 +20,8 @@ SLAB_HALF_M = 0.75  # about the flight height: every ray of the horizontal layer
 UPRIGHT_SPREAD_M = 1.2  # height spread over one cell that no slope of loose material reaches
 BRIDGED_GAPS_M = (0.75, 1.5, 3.0)  # holes in the walls that are still closed, tried in this order
 MAX_FIT_POINTS = 150_000
+FILLED_LEVELS = (0.1, 0.2, 0.4, 0.03)  # how full a wall's cell is against the fullest; dust fills few cells so well
+WITHIN_ENOUGH = 0.97  # share of all returns that true walls hold in, but for noise and open doors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +32,7 @@ class Footprint:
     share: (ny, nx) part of each cell inside the walls and outside obstacles. depth_m: (ny, nx) distance to the
     nearest wall, negative outside. blocked: cells whose returns belong to obstacles. noise_m: 1 sigma of wall returns
     about the fitted walls. fit_sigma_m: of the walls' own place. pose_sigma_m: how far the keyframes disagree on it.
+    beyond_ratio: share of all returns that lie beyond the walls, farther than noise throws them.
     """
 
     polygon_m: Array
@@ -42,6 +45,7 @@ class Footprint:
     fit_sigma_m: float
     pose_sigma_m: float
     ceiling_m: float
+    beyond_ratio: float
     warnings: tuple[str, ...]
 
     @property
@@ -68,11 +72,23 @@ def find_footprint(point_map: PointMap, grid: Grid, key: Index) -> Footprint:
         upright = _upright_without_path(point_map.points_map, grid, key)
         ceiling = np.inf
     upright &= key >= 0
-    structure = _structure_cells(grid.count(key[upright]))
-    region = _enclosed(structure, grid, key, point_map.path_map, fly_z)
-    if region is None:
+    count = grid.count(key[upright])
+    best: tuple[float, Mask, Mask] | None = None
+    for level in FILLED_LEVELS:
+        structure = _structure_cells(count, level)
+        region = _enclosed(structure, grid, key, point_map.path_map, fly_z)
+        if region is None:
+            continue
+        held = ndimage.binary_dilation(region, disc(cells_of(1.0, grid)))
+        within = float(np.mean(held.ravel()[np.maximum(key, 0)] & (key >= 0)))
+        if best is None or within > best[0]:
+            best = (within, structure, region)
+        if within >= WITHIN_ENOUGH:
+            break
+    if best is None:
         return _open_footprint(grid, key, ceiling)
-    return _closed_footprint(point_map, grid, key, upright, structure, region, ceiling)
+    footprint = _closed_footprint(point_map, grid, key, upright, best[1], best[2], ceiling)
+    return replace(footprint, beyond_ratio=1.0 - best[0])
 
 
 def _upright_without_path(points: Array, grid: Grid, key: Index) -> Mask:
@@ -94,12 +110,12 @@ def _upright_without_path(points: Array, grid: Grid, key: Index) -> Mask:
     return upright
 
 
-def _structure_cells(count: Array) -> Mask:
+def _structure_cells(count: Array, level: float) -> Mask:
     """Cells that upright returns fill well, against the best-filled cell nearby (noise thins out to the sides)."""
     filled = count[count > 0]
     if len(filled) == 0:
         return np.zeros(count.shape, dtype=np.bool_)
-    least = max(3.0, 0.02 * float(np.quantile(filled, 0.95)))
+    least = max(3.0, level * float(np.quantile(filled, 0.95)))
     nearby = ndimage.maximum_filter(count, size=7, mode="constant")
     return np.asarray((count >= least) & (count >= 0.15 * nearby))
 
@@ -161,6 +177,7 @@ def _open_footprint(grid: Grid, key: Index, ceiling: float) -> Footprint:
         fit_sigma_m=0.0,
         pose_sigma_m=0.0,
         ceiling_m=ceiling,
+        beyond_ratio=0.0,
         warnings=(),
     )
 
@@ -189,6 +206,7 @@ def _closed_footprint(
         fit_sigma_m=float(np.median([f.waviness_m for f in fits])) if fits else grid.cell_m,
         pose_sigma_m=_pose_disagreement(fits, points, point_map.keyframe_id[wall]),
         ceiling_m=ceiling,
+        beyond_ratio=0.0,
         warnings=(),
     )
     return _cut_obstacles(footprint, point_map.points_map, grid, key, structure)
