@@ -24,6 +24,7 @@ SENSOR_ABOVE_BASE_M = 0.03618  # origin of the lidar frame above that of the sen
 SERIAL = 992100000000
 INIT_ID = 1
 ALBEDO = 40
+UDP_PORT_LIDAR = 7502  # Ouster's own
 
 
 def sensor_info(cfg: LidarSimConfig) -> Any:
