@@ -27,9 +27,11 @@ class Lidar:
     """Call `cast` once each step; packets come out as their last column is done."""
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, body_id: int, cfg: LidarSimConfig, seed: int, began_ns: int
-    ) -> None:
-        """body_id: the carrier, which rays pass through. began_ns: simulated time of the first column."""
+        self, model: mujoco.MjModel, data: mujoco.MjData, body_id: int, cfg: LidarSimConfig, seed: int, began_ns: int,
+        step_ns: int = STEP_NS,
+    ) -> None:  # fmt: skip
+        """body_id: the carrier, which rays pass through. began_ns: simulated time of the first column. step_ns: the
+        longest time between two casts."""
         self._model, self._data, self._body_id = model, data, body_id
         self._columns, self._per_s = cfg.columns, cfg.columns * cfg.rate_hz
         self._began_ns, self._clock_offset_ns = began_ns, round(cfg.clock_offset_s * NS)
@@ -44,7 +46,7 @@ class Lidar:
         self._noise = np.zeros((cfg.columns, len(self._rows)))
         self._chance = np.zeros((cfg.columns, len(self._rows), 3))
         self._params = _parameters(cfg)
-        most = self._per_s * STEP_NS // NS + 2  # columns of the longest step
+        most = self._per_s * step_ns // NS + 2  # columns of the longest step
         self._shifts = np.zeros((most, 3))
         self._rays, self._normals = np.zeros(3 * most * len(self._rows)), np.zeros(3 * most * len(self._rows))
         self._distance = np.zeros(most * len(self._rows))

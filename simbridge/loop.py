@@ -54,7 +54,11 @@ class Truth:
 class Simulation:
     """One store, one vehicle, one seed: the same each time, to the last bit."""
 
-    def __init__(self, cfg: SimConfig, autopilot: Controller) -> None:
+    def __init__(
+        self, cfg: SimConfig, autopilot: Controller, *, step_ns: int = STEP_NS, commands_per_step: int = 1
+    ) -> None:
+        """step_ns: what `step` moves time by, at most 5 ms. commands_per_step: how often in it the flight controller
+        gets sensors and gives motor commands; 1 suits PX4, ArduCopter wants more than 720 a second."""
         kernels.warm_up()
         self.world: World = build_world(cfg.world, cfg.vehicle)
         self.start: tuple[float, float, float] = start_pose(cfg)
@@ -62,32 +66,39 @@ class Simulation:
         self.collision = False
         self.min_clearance_m = math.inf
         self._autopilot = autopilot
-        self._vehicle = Vehicle(self.world.model, self.world.surface, cfg.vehicle, cfg.world.wind, self.start, cfg.seed)
+        self._step_ns, self._commands = step_ns, commands_per_step
+        self._command_ns = command_ns = step_ns // commands_per_step
+        self._vehicle = Vehicle(
+            self.world.model, self.world.surface, cfg.vehicle, cfg.world.wind, self.start, cfg.seed, command_ns * 1e-9
+        )
         self._ground_z = float(self._vehicle.position[2])
-        self._imu = Imu(cfg.vehicle.imu, cfg.seed)
-        self._barometer = Barometer(cfg.vehicle.barometer, cfg.seed)
-        self._rangefinder = Rangefinder(cfg.vehicle.rangefinder, cfg.seed)
+        self._imu = Imu(cfg.vehicle.imu, cfg.seed, command_ns)
+        self._barometer = Barometer(cfg.vehicle.barometer, cfg.seed, command_ns)
+        self._rangefinder = Rangefinder(cfg.vehicle.rangefinder, cfg.seed, command_ns)
         v = self._vehicle
-        self._lidar = Lidar(self.world.model, v.data, v.body_id, cfg.lidar, cfg.seed, BOOT_NS)
+        self._lidar = Lidar(self.world.model, v.data, v.body_id, cfg.lidar, cfg.seed, BOOT_NS, step_ns)
         self._faults = SensorFaults(cfg.faults, cfg.seed, BOOT_NS)
         self._packets: list[bytes] = []
 
     def step(self) -> None:
         """4 ms: what the sensors measured goes to the flight controller, its motor commands move the vehicle."""
-        t_ns, vehicle = self.t_ns, self._vehicle
-        faults = self._faults
+        vehicle = self._vehicle
+        position, quat, velocity = vehicle.position.copy(), vehicle.q_world_body_wxyz.copy(), vehicle.motion[:3].copy()
+        for _ in range(self._commands):
+            self._command()
+        self._turn_lidar(position, quat)
+        self._watch(velocity)
+
+    def _command(self) -> None:
+        t_ns, vehicle, faults = self.t_ns, self._vehicle, self._faults
         imu = faults.imu(self._imu.sample(vehicle.inertial_frd, vehicle.thrust_ratio), t_ns)
         baro = faults.baro(self._barometer.sample(t_ns, float(vehicle.position[2])), t_ns)
         rangefinder_m = None
         if self._rangefinder.is_due(t_ns):
             rangefinder_m = self._rangefinder.sample(self._distance_down())
         rangefinder_m = faults.rangefinder(rangefinder_m, t_ns)
-        controls = self._autopilot.step(t_ns, imu, baro, rangefinder_m)
-        position, quat, velocity = vehicle.position.copy(), vehicle.q_world_body_wxyz.copy(), vehicle.motion[:3].copy()
-        vehicle.step(controls)
-        self.t_ns = t_ns + STEP_NS
-        self._turn_lidar(position, quat)
-        self._watch(velocity)
+        vehicle.step(self._autopilot.step(t_ns, imu, baro, rangefinder_m))
+        self.t_ns = t_ns + self._command_ns
 
     @property
     def liftoff_ns(self) -> int | None:
@@ -127,7 +138,7 @@ class Simulation:
         quat /= math.sqrt(float(quat @ quat))
         t_ns = self.t_ns
         self._lidar.range_bias_m = self._faults.lidar_bias_m(t_ns)
-        packets = self._lidar.cast(t_ns - STEP_NS // 2, t_ns, middle, quat, v.motion[:3], v.motion[3:])
+        packets = self._lidar.cast(t_ns - self._step_ns // 2, t_ns, middle, quat, v.motion[:3], v.motion[3:])
         self._packets += self._faults.lidar(packets, t_ns)
 
     def _watch(self, velocity_before: Array) -> None:
@@ -135,7 +146,7 @@ class Simulation:
         vehicle = self._vehicle
         if self._faults.liftoff_ns is None and float(vehicle.position[2]) > self._ground_z + LIFTOFF_M:
             self._faults.liftoff_ns = self.t_ns
-        if self.t_ns % CLEARANCE_PERIOD_NS < STEP_NS:
+        if self.t_ns % CLEARANCE_PERIOD_NS < self._step_ns:
             clearance = self.world.clearance(vehicle.position) - fp.VEHICLE_RADIUS_M
             self.min_clearance_m = min(self.min_clearance_m, clearance)
         if self.collision or not vehicle.has_contact:

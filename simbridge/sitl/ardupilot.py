@@ -107,10 +107,12 @@ class ArduPilotSitl:
         After a restart in flight nothing stands still: steps go on at wall time, motors off, until it asks again.
         """
         if self._was_connected:
-            self._request = self._receive(self.step_ns * 1e-9)
-            if self._request is None:
+            request = self._receive(self.step_ns * 1e-9)
+            if request is None:
                 self._check_silence()
-            return self._request is not None
+            else:
+                self._take(request)
+            return request is not None
         self._request = self._first_request()
         self._was_connected = True
         steady = 0
@@ -144,12 +146,15 @@ class ArduPilotSitl:
             if request is None:
                 break
             if not request.is_repeat:
-                self.restarts += request.is_restart
-                self._lost_s = None
-                return request
+                return self._take(request)
             self._reply(self._physics.repeated_reply())
         self._lost_s = time.monotonic()
         return None
+
+    def _take(self, request: ServoPacket) -> ServoPacket:
+        self.restarts += request.is_restart
+        self._request, self._lost_s = request, None
+        return request
 
     def _check_silence(self) -> None:
         if self._process is not None:
