@@ -100,8 +100,10 @@ class Commands:
     def next_deadline_ns(self) -> int | None:
         return min((queue[0].t_retry_ns for queue in self._queues.values() if queue), default=None)
 
-    def is_pending(self, command: int) -> bool:
-        return bool(self._queues.get(command))
+    def is_waiting(self, command: int, label: str) -> bool:
+        """The newest of this kind is the same and has had no answer yet."""
+        queue = self._queues.get(command)
+        return queue is not None and len(queue) > 0 and queue[-1].label == label
 
     def clear(self) -> None:
         """Forget all without a word: nothing asked of an autopilot before its restart may reach it after."""

@@ -24,7 +24,7 @@ FLAG_PREDICTED_ABSOLUTE = 512
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeReport:
-    """All that tells the mode. standard_mode: MAV_STANDARD_MODE that CURRENT_MODE gave for this custom mode, else None."""
+    """All that tells the mode. standard_mode: MAV_STANDARD_MODE of CURRENT_MODE for this custom mode, else None."""
 
     custom_mode: int
     landed_state: LandedState

@@ -49,16 +49,11 @@ class LinkUrl:
         raise LinkError(f"link {url!r} is not understood; {allowed}")
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
-    """Bytes as they came. t_ns: monotonic time of arrival. source: address, None where the link has only one end."""
-
-    data: bytes
-    t_ns: int
-    source: Address | None
+# Bytes as they came, monotonic time of arrival in ns, and the sender (None where the link has only one end).
+Packet = tuple[bytes, int, Address | None]
 
 
-class Link:
+class MavlinkLink:
     """An open link. `peer` is where `send` goes; it is the first that was heard, unless set."""
 
     def __init__(self, url: LinkUrl, now_ns: Callable[[], int]) -> None:
@@ -73,17 +68,13 @@ class Link:
         self._write: Callable[[bytes], None] = self._write_nowhere
         self._close: Callable[[], None] = lambda: None
 
-    async def receive(self) -> Packet:
-        """The next packet. Raises LinkError when the other end has closed and nothing is left."""
+    async def take(self) -> list[Packet]:
+        """All that has come, as soon as there is any. Raises LinkError: the other end has closed."""
         while not self._queue:
             if not self.is_open:
                 raise LinkError(f"link {self.url.scheme}://{self.url.host}:{self.url.port} was closed by the other end")
             self._arrived.clear()
             await self._arrived.wait()
-        return self._queue.popleft()
-
-    def receive_waiting(self) -> list[Packet]:
-        """All that has come by now, without waiting."""
         packets = list(self._queue)
         self._queue.clear()
         return packets
@@ -109,7 +100,7 @@ class Link:
             self.shed += 1
         if self.peer is None:
             self.peer = source
-        self._queue.append(Packet(data, self._now_ns(), source))
+        self._queue.append((data, self._now_ns(), source))
         self._arrived.set()
 
     def _end(self) -> None:
@@ -117,10 +108,10 @@ class Link:
         self._arrived.set()
 
 
-async def open_link(url: str, *, now_ns: Callable[[], int] = time.monotonic_ns) -> Link:
+async def open_link(url: str, *, now_ns: Callable[[], int] = time.monotonic_ns) -> MavlinkLink:
     """Open a link. Raises LinkError: address, reason, how to mend it."""
     address = LinkUrl.parse(url)
-    link = Link(address, now_ns)
+    link = MavlinkLink(address, now_ns)
     opener = {"udpin": _open_udp, "udpout": _open_udp, "tcpin": _open_tcp_server, "tcpout": _open_tcp_client}
     try:
         await opener.get(address.scheme, _open_serial)(link)
@@ -141,7 +132,7 @@ def _advice(error: Exception) -> str:
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: MavlinkLink) -> None:
         self._link = link
 
     def datagram_received(self, data: bytes, addr: tuple[str | object, int]) -> None:
@@ -151,7 +142,7 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._link.send_errors += 1  # e.g. port unreachable: the autopilot is not up yet
 
 
-async def _open_udp(link: Link) -> None:
+async def _open_udp(link: MavlinkLink) -> None:
     here = (link.url.host, link.url.port)
     is_server = link.url.scheme == "udpin"
     transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
@@ -169,7 +160,7 @@ async def _open_udp(link: Link) -> None:
 
 
 class _Stream(asyncio.Protocol):
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: MavlinkLink) -> None:
         self._link = link
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -190,19 +181,19 @@ class _Stream(asyncio.Protocol):
             self._link._end()
 
 
-async def _open_tcp_server(link: Link) -> None:
+async def _open_tcp_server(link: MavlinkLink) -> None:
     server = await asyncio.get_running_loop().create_server(lambda: _Stream(link), link.url.host, link.url.port)
     link._close = server.close
 
 
-async def _open_tcp_client(link: Link) -> None:
+async def _open_tcp_client(link: MavlinkLink) -> None:
     transport, _ = await asyncio.get_running_loop().create_connection(
         lambda: _Stream(link), link.url.host, link.url.port
     )
     link._close = transport.close
 
 
-async def _open_serial(link: Link) -> None:
+async def _open_serial(link: MavlinkLink) -> None:
     device, baud = link.url.host, link.url.port
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:

@@ -49,6 +49,10 @@ class Sources:
             self.address = source
         return None
 
+    def drop(self, reason: str) -> None:
+        """Count a message whose content cannot be used."""
+        self.refused[reason] += 1
+
     def release(self) -> None:
         """The link is lost: whoever answers next as the autopilot is taken."""
         self.address = None

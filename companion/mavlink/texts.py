@@ -11,6 +11,8 @@ from companion.messages import Event, Severity
 
 _CHUNK = 50
 _MAX_OPEN = 8
+_EVENT_AGAIN_NS = 60_000_000_000
+_MAX_TOLD = 256
 
 
 def pack_text(event: Event, text_id: int) -> list[bytes]:
@@ -36,6 +38,8 @@ class Texts:
 
     def __init__(self) -> None:
         self._open: OrderedDict[int, _Open] = OrderedDict()
+        self._event_sequence: int | None = None
+        self._told: OrderedDict[tuple[int, int], int] = OrderedDict()
 
     def on_text(self, payload: bytes, t_ns: int) -> list[Event]:
         severity, text, text_id, sequence = wire.unpack(wire.STATUSTEXT, payload)
@@ -51,6 +55,21 @@ class Texts:
             return []
         return [self._close(text_id, t_ns)]
 
+    def on_event(self, payload: bytes, t_ns: int) -> list[Event]:
+        """EVENT (410), by which alone PX4 speaks to a companion (PX4.md, 7). Those of its arming checks come again
+        every two seconds: each is told once a minute."""
+        event_id, _, sequence, _, _, levels, _ = wire.unpack(wire.EVENT, payload)
+        level = levels & 0x0F  # external; 8 and above are PX4's own protocol, not for people
+        is_repeated, self._event_sequence = sequence == self._event_sequence, sequence
+        told_ns = self._told.get((event_id, level))
+        if is_repeated or level > Severity.DEBUG or (told_ns is not None and t_ns - told_ns < _EVENT_AGAIN_NS):
+            return []
+        self._told[event_id, level] = t_ns
+        if len(self._told) > _MAX_TOLD:
+            self._told.popitem(last=False)
+        text = EVENT_TEXTS.get(event_id, f"PX4 event {event_id} (no text known here)")
+        return [Event(t_ns=t_ns, severity=Severity(level), name="autopilot_event", text=text)]
+
     def _close(self, text_id: int, t_ns: int) -> Event:
         entry = self._open.pop(text_id)
         parts = [entry.parts.get(i, b"[...]") for i in range(max(entry.parts) + 1)]
@@ -60,11 +79,3 @@ class Texts:
 def _text_event(t_ns: int, severity: int, text: bytes) -> Event:
     words = text.decode(errors="replace").rstrip("\0").strip()  # PX4's end in a tab
     return Event(t_ns=t_ns, severity=Severity(min(severity, 7)), name="autopilot_text", text=words)
-
-
-def decode_event(payload: bytes, t_ns: int) -> tuple[Event, int]:
-    """EVENT (410) and its sequence number. PX4 tells a companion nothing by STATUSTEXT, only by these (PX4.md, 7)."""
-    event_id, _, sequence, _, _, levels, _ = wire.unpack(wire.EVENT, payload)
-    external = min(levels & 0x0F, 7)
-    text = EVENT_TEXTS.get(event_id, f"PX4 event {event_id} (no text known here)")
-    return Event(t_ns=t_ns, severity=Severity(external), name="autopilot_event", text=text), int(sequence)

@@ -37,6 +37,7 @@ class Vehicle:
     boot_ms: int | None = None
     wanted_mode: FlightMode | None = None
     pilot_has_control: bool = False
+    joined_in_flight: bool = False
     _link: str = "none"
 
     @property
