@@ -33,6 +33,11 @@ def encode(message: object) -> bytes:
     return _dump(_encode_fields(message))
 
 
+def encode_value(value: object) -> bytes:
+    """JSON of plain values, messages, arrays and dicts of them; never fails on inf or nan."""
+    return _dump(_value(value))
+
+
 def decode(kind: type[T], data: bytes) -> T:
     """The message again. Raises: ValueError, KeyError, TypeError: not the JSON of such a message."""
     value: T = _decode(kind, json.loads(data))
@@ -67,6 +72,8 @@ def _value(value: Any) -> Any:
         return value.value
     if isinstance(value, (tuple, list)):
         return [_value(v) for v in value]
+    if isinstance(value, dict):
+        return {str(k): _value(v) for k, v in value.items()}
     if isinstance(value, np.generic):
         return _value(value.item())
     if dataclasses.is_dataclass(value):
