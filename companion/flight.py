@@ -88,6 +88,7 @@ class Flight:
     _commands: list[OperatorCommand] = field(init=False, default_factory=list)
     _mapped_ns: int | None = field(init=False, default=None)
     _judged: OdometryEstimate | None = field(init=False, default=None)
+    _below_m: float | None = field(init=False, default=None)
     _sent_odometry_ns: int | None = field(init=False, default=None)
     _odometry_beat: _Beat = field(init=False)
     _setpoint_beat: _Beat = field(init=False)
@@ -120,6 +121,7 @@ class Flight:
                 self.odometry.on_attitude(message)
                 self.tap(topics.ATTITUDE, t_ns, message)
             elif isinstance(message, RangefinderSample):
+                self._below_m = message.distance_m
                 self.odometry.on_rangefinder(message)
                 self.tap(topics.RANGEFINDER, t_ns, message)
             elif isinstance(message, Event):
@@ -205,12 +207,21 @@ class Flight:
         self.tap(topics.VEHICLE, t_ns, state)
         commands, self._commands = tuple(self._commands), []
         output = self.navigator.step(
-            t_ns, NavigatorInput(estimate=self.estimate, walls=self.walls, vehicle=state, commands=commands)
+            t_ns,
+            NavigatorInput(
+                estimate=self.estimate,
+                walls=self.walls,
+                vehicle=state,
+                commands=commands,
+                time_synced=self.session.time_synced,
+            ),
         )
         self.navigation = output
         verdict = self.guard.check(
             output.setpoint, t_ns,
-            GuardInput(estimate=self.estimate, walls=self.walls, vehicle=state, commands=commands),
+            GuardInput(
+                estimate=self.estimate, walls=self.walls, vehicle=state, commands=commands, below_m=self._below_m
+            ),
         )  # fmt: skip
         for request in (*output.requests, *verdict.requests):
             self.session.request(request)

@@ -32,8 +32,8 @@ class Wire(Protocol):
     def take(self, t_ns: int) -> list[bytes]:
         """Frames from the flight controller that have arrived."""
 
-    def send(self, frame: bytes, t_ns: int) -> None:
-        """A frame to the flight controller."""
+    def send(self, frames: list[bytes], t_ns: int) -> None:
+        """Frames to the flight controller; called each step, also with none."""
 
 
 @dataclass(slots=True)
@@ -95,11 +95,12 @@ class Lockstep:
             flight.on_mavlink(frame, t_ns)
         if t_ns >= flight.next_deadline_ns():
             flight.poll(t_ns)
-        for frame in flight.take_output():
+        frames = flight.take_output()
+        for frame in frames:
             self._digest.update(frame)
             if self.on_output is not None:
                 self.on_output(t_ns, frame)
-            self.wire.send(frame, simulation.t_ns)
+        self.wire.send(frames, simulation.t_ns)
         if simulation.t_ns % TRUTH_PERIOD_NS == 0:
             self._log_truth(t_ns)
 

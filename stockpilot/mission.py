@@ -214,7 +214,9 @@ def _real_location(location: Location, raw: object) -> Location:
     here: object = raw
     for n, part in enumerate(location):
         last = n == len(location) - 1
-        if (isinstance(here, dict) and part in here) or (isinstance(here, list) and isinstance(part, int) and part < len(here)):
+        if (isinstance(here, dict) and part in here) or (
+            isinstance(here, list) and isinstance(part, int) and part < len(here)
+        ):
             here = here[part]
             out.append(part)
         elif last and not (isinstance(part, str) and ("[" in part or not isinstance(here, dict))):

@@ -16,12 +16,13 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from companion.errors import ConfigError
 from companion.flight import Flight
 from simbridge.autopilot import Autopilot
+from simbridge.config import SimConfig
 from simbridge.loop import Simulation
 from simbridge.world import World
 from stockpilot.lockstep import Lockstep, Outcome, Wire
 from stockpilot.mission import Mission, load_mission
 from stockpilot.results import Scored, score_flight
-from stockpilot.wires import EmulatedWire
+from stockpilot.wires import EmulatedWire, emulated_autopilot
 
 SECONDS_BEYOND_FLIGHT = 300.0  # on the ground: time sync, vision, arming
 
@@ -49,14 +50,22 @@ class Prepared:
     closing: ExitStack = field(default_factory=ExitStack)
 
 
+def emulated(cfg: SimConfig) -> tuple[Simulation, Autopilot]:
+    """The world with the emulated flight controller. Raises: ConfigError: an unknown parameter."""
+    try:
+        controller = emulated_autopilot(cfg)
+    except ValueError as error:
+        raise ConfigError(f"autopilot.params: {error}") from None
+    return Simulation(cfg, controller), controller
+
+
 def prepare(mission: Mission, *, autopilot: str = "emulated", binary: Path | None = None) -> Prepared:
     """Build the world, the flight controller and the companion. Raises: ConfigError: no world; no such autopilot."""
     if mission.sim is None:
         raise ConfigError(f"{mission.path}: world: is missing: only `stockpilot fly` can fly a mission without a world")
     if autopilot == "emulated":
-        controller = Autopilot(mission.sim.autopilot.params, seed=mission.sim.seed)
-        simulation = Simulation(mission.sim, controller)
-        wire: Wire = EmulatedWire(controller, mission.sim.faults, seed=mission.sim.seed)
+        simulation, controller = emulated(mission.sim)
+        wire: Wire = EmulatedWire(controller, mission.sim, lambda: simulation.liftoff_ns)
         closing = ExitStack()
     else:
         from stockpilot.real_autopilot import prepare_real

@@ -94,7 +94,7 @@ def cast_plan(origin_xy: Array, bearing_rad: Array, outline: list[Array]) -> tup
     Args: origin_xy: (2,). bearing_rad: (M,) world bearings. outline: closed rings, (K, 2) each.
     Returns: (M,) distances, inf where nothing is met; (M, 2) unit normals of the edges met (0 where none).
     """
-    a = np.concatenate([ring for ring in outline])
+    a = np.concatenate(outline)
     b = np.concatenate([np.roll(ring, -1, axis=0) for ring in outline])
     d = np.column_stack([np.cos(bearing_rad), np.sin(bearing_rad)])
     edge = b - a
