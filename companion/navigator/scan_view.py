@@ -30,11 +30,13 @@ class Wall:
     """The wall nearest in some direction. distance_m: perpendicular. normal_rad: body bearing of its nearest place.
 
     is_line: a straight line was fitted through enough returns; else it is the nearest return (corner, column, pile).
+    ends_m: how far the line is seen to the clockwise and to the counter-clockwise side of its nearest place.
     """
 
     distance_m: float
     normal_rad: float
     is_line: bool
+    ends_m: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +139,7 @@ def _accept(
     angle = math.atan2(float(normal[1]), float(normal[0]))
     if abs(d - nearest_m) > FIT_MAX_OFFSET_M or math.cos(angle - bearing_rad) < 0.8:
         return None
-    return Wall(d, angle, True)
+    return Wall(d, angle, True, (here - low, high - here))
 
 
 def window(low_rad: float, high_rad: float) -> NDArray[np.bool_]:

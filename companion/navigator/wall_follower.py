@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from companion.config import GuardConfig, NavigatorConfig
+from companion.config import CompanionConfig
 from companion.geometry import wrap_angle
 from companion.navigator.scan_view import ScanView, Wall
 
@@ -27,7 +27,15 @@ SIDE_GAIN_PER_S = 0.15
 BRAKE_GAIN_PER_S = 0.6
 TURN_MARGIN_M = 0.1
 YAW_GAIN_PER_S = 1.5
+STRAIGHT_M = 1.0  # seen to both sides of the foot: neither at a corner nor beside a column
+LANE_RIGHT_M = 1.0  # narrow on the right: there d_r keeps the distance
 MIN_DAMPING_MPS = 0.25  # the derivative keeps working when slow
+
+
+def lane_m(config: CompanionConfig) -> float:
+    """Half width of a lane to fly in: what stands nearer to its middle line is in the way."""
+    wall = config.navigator.wall_distance_m
+    return min(max(0.5 * wall, config.guard.stop_distance_m + 0.4), 3.0, wall)
 
 
 class FollowMode(Enum):
@@ -58,11 +66,12 @@ class Steering:
 
 @dataclass(frozen=True, slots=True)
 class _MapWall:
-    """A wall's line in map: points p with normal . p = offset; the normal points from us to it."""
+    """A wall's line in map: points p with normal . p = offset; the normal points from us to it. is_straight: not
+    near its end, nor a corner."""
 
     normal_rad: float
     offset_m: float
-    is_line: bool
+    is_straight: bool
 
     def distance_m(self, pose: Pose2) -> float:
         return self.offset_m - math.cos(self.normal_rad) * pose.x - math.sin(self.normal_rad) * pose.y
@@ -71,20 +80,14 @@ class _MapWall:
 class WallFollower:
     """Holds which wall it follows, and whether it turns. Distances and speeds from the mission's configuration."""
 
-    def __init__(self, cfg: NavigatorConfig, guard: GuardConfig) -> None:
+    def __init__(self, config: CompanionConfig) -> None:
+        cfg = config.navigator
         self._cfg = cfg
         self._turn_rate = math.radians(cfg.turn_rate_dps)
-        # The lane ahead is narrow on the right, where d_r holds the distance, and wide on the left.
-        self._lane_left = min(max(0.5 * cfg.wall_distance_m, guard.stop_distance_m + 0.4), 3.0, cfg.wall_distance_m)
-        self._lane_right = 1.0
+        self._lane_left = lane_m(config)
         self.mode = FollowMode.AHEAD
         self._wall: _MapWall | None = None
         self._front_m = math.inf
-
-    @property
-    def lane_m(self) -> float:
-        """Half width of a lane that is wide enough to fly in."""
-        return self._lane_left
 
     def start(self, *, turning_to: Wall | None, pose: Pose2) -> None:
         """Begin anew: already along a wall, or (turning_to) facing one."""
@@ -95,7 +98,7 @@ class WallFollower:
     def see(self, view: ScanView, pose: Pose2) -> None:
         """Take in a new scan and the pose it was taken at."""
         # Eq. 4, as wide as the vehicle's lane.
-        self._front_m, front_rad = view.ahead(0.0, self._lane_left, self._lane_right)
+        self._front_m, front_rad = view.ahead(0.0, self._lane_left, LANE_RIGHT_M)
         if self.mode is FollowMode.TURN:
             self._track(view, pose)
             return
@@ -131,7 +134,7 @@ class WallFollower:
         yaw_rate = _clamp(cfg.kp_per_m * error, steepest) - damping * math.sin(off_parallel)
         forward = speed * (1.0 if abs(off_parallel) < math.radians(25) else 0.4)
         side = _clamp(SIDE_GAIN_PER_S * error, min(MAX_SIDE_MPS, 0.5 * speed_mps))
-        straight = self._wall.is_line and abs(off_parallel) < math.radians(10)
+        straight = self._wall.is_straight and abs(off_parallel) < math.radians(10)
         return Steering(forward, side, _clamp(yaw_rate, self._turn_rate), straight, distance, self._front_m)
 
     def _turn(self, left_to_turn: float, pose: Pose2) -> Steering:
@@ -159,7 +162,7 @@ class WallFollower:
 def _in_map(wall: Wall, pose: Pose2) -> _MapWall:
     normal = wrap_angle(wall.normal_rad + pose.yaw)
     offset = math.cos(normal) * pose.x + math.sin(normal) * pose.y + wall.distance_m
-    return _MapWall(normal, offset, wall.is_line)
+    return _MapWall(normal, offset, wall.is_line and min(wall.ends_m) > STRAIGHT_M)
 
 
 def _clamp(value: float, limit: float) -> float:

@@ -53,7 +53,8 @@ def pilasters(width: float, depth: float) -> list[Ring]:
 
 
 HALLS: dict[str, list[Ring]] = {
-    "cement_store": [rectangle(0, 0, 50, 30), *pilasters(50, 30)],
+    "cement_store": [rectangle(0, 0, 50, 30)],
+    "pilasters": [rectangle(0, 0, 50, 30), *pilasters(50, 30)],
     # A pile against the long wall, cut by the layer in a bulge that reaches 5 m into the hall.
     "leaning_pile": [rectangle(0, 0, 50, 30), [(18, 30), (20, 27), (24, 25), (28, 25.5), (31, 28), (32, 30)]],
     "l_shaped": [[(0, 0), (60, 0), (60, 26), (34, 26), (34, 52), (0, 52)]],

@@ -1,0 +1,72 @@
+"""What the navigator knows at one step: where it is, what it sees, how well."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from companion.config import CompanionConfig
+from companion.geometry import yaw_from_quat
+from companion.messages import OdometryEstimate, VehicleState
+from companion.navigator.interface import NavigatorInput
+from companion.navigator.scan_view import ScanView
+from companion.navigator.wall_follower import Pose2
+from companion.navigator.watch import Vision, VisionWatch
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """pose, z_m: the newest good ones, map. view: of a scan not seen before, taken at view_pose; else None."""
+
+    t_ns: int
+    vehicle: VehicleState | None
+    vision: Vision
+    pose: Pose2
+    z_m: float
+    view: ScanView | None
+    view_pose: Pose2
+
+    def since_s(self, t_ns: int | None) -> float:
+        return (self.t_ns - t_ns) / 1e9 if t_ns is not None else 0.0
+
+
+NOTHING_YET = Situation(
+    0, None, Vision(False, "nothing came yet", 1.0, 0.0, False), Pose2(0.0, 0.0, 0.0), 0.0, None, Pose2(0.0, 0.0, 0.0)
+)
+
+
+class Lookout:
+    """Builds the situation. Poses are kept for two seconds, so that a scan is placed where it was taken."""
+
+    def __init__(self, config: CompanionConfig) -> None:
+        self._watch = VisionWatch(config.guard, config.lidar)
+        self._poses: deque[tuple[int, Pose2]] = deque(maxlen=40)
+        self._scan_ns = -1
+        self._last = NOTHING_YET
+
+    def look(self, t_ns: int, inputs: NavigatorInput) -> Situation:
+        vision = self._watch.step(t_ns, inputs.estimate, inputs.walls)
+        pose, z, view, view_pose = self._last.pose, self._last.z_m, None, self._last.view_pose
+        if inputs.estimate is not None and vision.is_good:
+            pose, z = self._place(inputs.estimate)
+            if inputs.walls is not None and inputs.walls.t_ns > self._scan_ns:
+                self._scan_ns = inputs.walls.t_ns
+                view, view_pose = ScanView.of(inputs.walls), self._pose_at(inputs.walls.t_ns)
+        self._last = Situation(t_ns, inputs.vehicle, vision, pose, z, view, view_pose)
+        return self._last
+
+    def _place(self, estimate: OdometryEstimate) -> tuple[Pose2, float]:
+        x, y, z = (float(v) for v in estimate.position_map_m)
+        pose = Pose2(x, y, yaw_from_quat(estimate.q_map_body_wxyz))
+        if not self._poses or estimate.t_ns > self._poses[-1][0]:
+            self._poses.append((estimate.t_ns, pose))
+        return pose, z
+
+    def _pose_at(self, t_ns: int) -> Pose2:
+        """The pose nearest in time, looked for from the newest back."""
+        best = self._poses[-1]
+        for known in reversed(self._poses):
+            if abs(known[0] - t_ns) > abs(best[0] - t_ns):
+                break
+            best = known
+        return best[1]
