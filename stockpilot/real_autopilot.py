@@ -1,0 +1,102 @@
+"""A real PX4 or ArduCopter in the place of the emulated flight controller, for `run` (lockstep) and `sim` (real time)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from companion.errors import ConfigError, LinkError
+from simbridge.config import SimConfig
+from simbridge.faults import LinkFaults
+from simbridge.loop import Simulation
+from simbridge.server import UdpLink
+from simbridge.sitl import SitlError, parameters
+from simbridge.sitl.ardupilot import ArduPilotSitl
+from simbridge.sitl.process import AutopilotProcess, start_arducopter, start_px4
+from simbridge.sitl.px4 import Px4Sitl
+
+COMPANION_PORT = 14540  # where PX4 sends; ArduCopter is told to
+PX4_OFFBOARD_PORT = 14580
+PX4_COMMANDS_PER_STEP, PX4_STEP_NS = 1, 4_000_000
+ARDUPILOT_COMMANDS_PER_STEP, ARDUPILOT_STEP_NS = 4, 5_000_000  # 800 Hz
+
+
+class RealWire:
+    """The companion's MAVLink to a real autopilot on this machine: UDP, with the faults of a mission."""
+
+    def __init__(self, link: UdpLink, cfg: SimConfig, liftoff_ns: Callable[[], int | None]) -> None:
+        self._link, self._liftoff_ns = link, liftoff_ns
+        self._has_faults = bool(cfg.faults)
+        self._down = LinkFaults(cfg.faults, "from_autopilot", cfg.seed)
+        self._up = LinkFaults(cfg.faults, "to_autopilot", cfg.seed)
+
+    def take(self, t_ns: int) -> list[bytes]:
+        datagrams = self._link.receive()
+        return self._down.pass_on(datagrams, t_ns, self._liftoff_ns()) if self._has_faults else datagrams
+
+    def send(self, frames: list[bytes], t_ns: int) -> None:
+        if self._has_faults:
+            frames = self._up.pass_on(frames, t_ns, self._liftoff_ns())
+        for frame in frames:
+            self._link.send(frame)
+
+
+def prepare_real(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple[Simulation, RealWire, ExitStack]:
+    """World, wire and what ends them, for a flight in lockstep. Raises: ConfigError, LinkError."""
+    with ExitStack() as stack:
+        try:
+            link = UdpLink(remote=("127.0.0.1", PX4_OFFBOARD_PORT), local=("127.0.0.1", COMPANION_PORT))
+        except OSError as error:
+            raise LinkError(
+                f"UDP port {COMPANION_PORT}, where the autopilot sends, is taken ({error.strerror}): another companion?"
+            ) from error
+        stack.callback(link.close)
+        simulation, closing = simulation_for(cfg, autopilot, binary)
+        stack.enter_context(closing)
+        return simulation, RealWire(link, cfg, lambda: simulation.liftoff_ns), stack.pop_all()
+    raise AssertionError("unreachable")
+
+
+def simulation_for(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple[Simulation, ExitStack]:
+    """The world with a real flight controller: started from `binary`, else waited for. Close the stack to end both.
+
+    Raises: ConfigError: no such autopilot, no such binary, parameters of another. LinkError: a port is taken.
+    """
+    with ExitStack() as stack:
+        try:
+            if autopilot == "px4":
+                simulation = _with_px4(cfg, binary, stack)
+            elif autopilot == "ardupilot":
+                simulation = _with_arducopter(cfg, binary, stack)
+            else:
+                raise ConfigError(f"--autopilot {autopilot}: is none of emulated, px4, ardupilot")
+        except SitlError as error:
+            raise LinkError(str(error)) from error
+        return simulation, stack.pop_all()
+    raise AssertionError("unreachable")
+
+
+def _with_px4(cfg: SimConfig, binary: Path | None, stack: ExitStack) -> Simulation:
+    process: AutopilotProcess | None = None
+    if binary is not None:
+        process = stack.enter_context(start_px4(binary, parameters.PX4 | cfg.autopilot.params))
+    sitl = Px4Sitl(process=process, seed=cfg.seed)
+    stack.callback(sitl.close)
+    simulation = Simulation(cfg, sitl, step_ns=PX4_STEP_NS, commands_per_step=PX4_COMMANDS_PER_STEP)
+    sitl.attach(simulation.truth)
+    return simulation
+
+
+def _with_arducopter(cfg: SimConfig, binary: Path | None, stack: ExitStack) -> Simulation:
+    if cfg.autopilot.params:
+        names = ", ".join(sorted(cfg.autopilot.params))
+        raise ConfigError(f"autopilot.params: {names}: are PX4's; a mission for ArduCopter has none")
+    process: AutopilotProcess | None = None
+    if binary is not None:
+        process = stack.enter_context(start_arducopter(binary, parameters.ARDUPILOT, offboard_port=COMPANION_PORT))
+    sitl = ArduPilotSitl(process=process)
+    stack.callback(sitl.close)
+    simulation = Simulation(cfg, sitl, step_ns=ARDUPILOT_STEP_NS, commands_per_step=ARDUPILOT_COMMANDS_PER_STEP)
+    sitl.attach(simulation.truth)
+    return simulation
