@@ -165,7 +165,7 @@ def _open_mcap(path: Path, topic: str | None) -> ScanFile:
     wanted: set[str] = set()
     own = channels.INPUT_PREFIX + "lidar"
     for item in scan_of(path):
-        if isinstance(item, Attachment) and item.name == "lidar_metadata.json":
+        if isinstance(item, Attachment) and item.name == "lidar.json":
             metadata = item.data.decode()
         elif isinstance(item, Message) and item.channel.topic not in wanted:
             wanted.add(item.channel.topic)
@@ -173,7 +173,7 @@ def _open_mcap(path: Path, topic: str | None) -> ScanFile:
                 break
     if topic in (None, own) and own in wanted:
         if metadata is None:
-            raise FileFormatError(f"{path}: lacks the attachment lidar_metadata.json: its packets cannot be read")
+            raise FileFormatError(f"{path}: lacks the attachment lidar.json: its packets cannot be read")
         decoder = OusterDecoder(metadata)
         scans = _own_scans(path, decoder)
         return ScanFile(kind=FileKind.MCAP, sensor="Ouster packets of a flight", scans=scans, dropped=decoder.dropped)
