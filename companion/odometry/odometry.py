@@ -151,7 +151,7 @@ class Odometry:
         return ScanResult(
             estimate=estimate_at(snapshot, history, scan.t_ns, is_scan=True),
             levelled=levelled,
-            wall_ranges=wall_ranges(scan.t_ns, every, row, self._cfg.lidar.min_range_m),
+            wall_ranges=wall_ranges(scan, every, self._leveller.r_body_lidar, self._cfg.lidar.min_range_m),
             keyframe=snapshot.is_keyframe,
             registration=registration,
             judgement=judgement,
