@@ -6,6 +6,7 @@ between the corners are those of the triangles, everywhere (rays, contact, volum
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ from simbridge.kernels import triangle
 
 Array = NDArray[np.float64]
 
+OFF_GRID = 0.3819660  # of a cell: keeps the triangles' edges off round numbers, where a ray may slip between two
 THINNEST_M = 0.01  # a thinner layer counts as swept floor
 
 
@@ -69,9 +71,12 @@ class Surface:
     def contour(self, hall: Any) -> Any:
         """Plan outline of the material inside the walls: a shapely (multi)polygon."""
         iy, ix = np.nonzero(self.cells_with_material())
-        x, y = self.x0 + ix * self.cell_m, self.y0 + iy * self.cell_m
-        cells = shapely.box(x, y, x + self.cell_m, y + self.cell_m)
-        return shapely.union_all(cells).intersection(hall)
+        return shapely.union_all(self.boxes(ix, iy)).intersection(hall)
+
+    def boxes(self, ix: NDArray[np.intp], iy: NDArray[np.intp]) -> Any:
+        """Outlines of cells; those of neighbours share their corners to the last bit."""
+        x, y, cell = self.x0, self.y0, self.cell_m
+        return shapely.box(x + ix * cell, y + iy * cell, x + (ix + 1) * cell, y + (iy + 1) * cell)
 
 
 def build_surface(world: WorldConfig) -> Surface:
@@ -79,8 +84,8 @@ def build_surface(world: WorldConfig) -> Surface:
     hall = fp.outline(world.footprint)
     cell = world.pile_cell_m
     low_x, low_y, high_x, high_y = hall.bounds
-    x = np.arange(low_x - 2 * cell, high_x + 3 * cell, cell)
-    y = np.arange(low_y - 2 * cell, high_y + 3 * cell, cell)
+    x = low_x - OFF_GRID * cell + cell * np.arange(-2, math.ceil((high_x - low_x) / cell) + 4)
+    y = low_y - OFF_GRID * cell + cell * np.arange(-2, math.ceil((high_y - low_y) / cell) + 4)
     gx, gy = np.meshgrid(x, y)
 
     def floor_of(px: Array, py: Array) -> Array:
@@ -125,9 +130,7 @@ def _thickness_integral(surface: Surface, area: Any) -> float:
     """Integral of z - floor over a polygon: whole cells at once, cells on its edge cut exactly."""
     cell = surface.cell_m
     iy, ix = np.nonzero(surface.cells_with_material())
-    boxes = shapely.box(
-        surface.x0 + ix * cell, surface.y0 + iy * cell, surface.x0 + (ix + 1) * cell, surface.y0 + (iy + 1) * cell
-    )
+    boxes = surface.boxes(ix, iy)
     shapely.prepare(area)
     whole = shapely.contains_properly(area, boxes)
     cut = shapely.intersects(area, boxes) & ~whole
