@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from companion.config import NavigatorConfig
 from companion.geometry import wrap_angle
 from companion.messages import Array
-from companion.navigator.scan_view import BEARING_RAD, DIRECTION, SECTORS, ScanView, Wall
+from companion.navigator.scan_view import BEARING_RAD, DIRECTION, FAR_M, SECTORS, ScanView, Wall
 from companion.navigator.wall_follower import (
     BRAKE_GAIN_PER_S,
     FRONT_RAD,
@@ -140,9 +140,9 @@ def wall_bearing(view: ScanView, pose: Pose2, lane_m: float, islands: tuple[Isla
 def free_standing(smooth_m: Array) -> NDArray[np.bool_]:
     """(360,) True where a surface seems to be an island: narrow, with a step outward at both ends."""
     ranges = _without_holes(smooth_m)
-    step = np.roll(ranges, -1) - ranges  # from sector n to n + 1, counter-clockwise
-    with np.errstate(invalid="ignore"):
-        edges = np.flatnonzero(np.abs(step) > EDGE_JUMP_M)  # between n and n + 1; inf - inf is no edge
+    far = np.where(np.isfinite(ranges), ranges, FAR_M)
+    step = np.roll(far, -1) - far  # from sector n to n + 1, counter-clockwise
+    edges = np.flatnonzero(np.abs(step) > EDGE_JUMP_M)  # between n and n + 1
     out = np.zeros(SECTORS, dtype=np.bool_)
     for start, end in zip(edges, np.roll(edges, -1), strict=True):
         members = np.arange(start + 1, end + 1 + (SECTORS if end <= start else 0)) % SECTORS

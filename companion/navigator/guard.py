@@ -43,6 +43,7 @@ FLOOR_M = 0.3  # above the place of take-off: lower only in the flight controlle
 NEAR_GROUND_M = 1.0  # measured below: do not sink further
 DEGENERATE_SPEED_RATIO = 0.5
 LANDING_MODES = frozenset({FlightMode.LAND, FlightMode.DESCEND})
+TELL_AGAIN_NS = 10_000_000_000
 NEVER = -(10**18)
 
 
@@ -82,7 +83,7 @@ class Guard:
         self._first_ns: int | None = None
         self._breach_ns: int | None = None
         self._asked_ns = NEVER
-        self._told = ""
+        self._told: dict[str, int] = {}
         self.is_silent = True  # estimates too: vision is too old to be sent
 
     @property
@@ -269,10 +270,11 @@ class Guard:
         return (xy - excess * outward, "at the fence") if excess > 0 else (xy, "")
 
     def _tell(self, events: list[Event], t_ns: int, severity: Severity, name: str, why: str) -> None:
-        """Once for each change of what is wrong."""
-        if why and why != self._told:
+        """When something begins to be wrong; what comes and goes is told once in TELL_AGAIN_NS."""
+        if why and t_ns - self._told.get(why, NEVER) > TELL_AGAIN_NS:
             events.append(Event(t_ns=t_ns, severity=severity, name=name, text=why))
-        self._told = why
+        if why:
+            self._told[why] = t_ns
 
 
 def _nearest_in_time(poses: deque[tuple[int, Array, float]], t_ns: int) -> tuple[int, Array, float]:

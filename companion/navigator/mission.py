@@ -193,7 +193,7 @@ class Navigator:
     # ---- on the ground ----------------------------------------------------------------------------------------------
 
     def _note_readiness(self, inputs: NavigatorInput) -> None:
-        why = not_ready(self._now, inputs)
+        if tuple(w.split(":")[0] for w in why) != tuple(w.split(":")[0] for w in self._not_ready):  # not each count
         if why != self._not_ready:
             self._not_ready = why
             if why:

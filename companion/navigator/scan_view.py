@@ -21,6 +21,7 @@ FIT_MIN_POINTS = 12
 FIT_MIN_LENGTH_M = 1.5
 FIT_MAX_OFFSET_M = 0.7  # a line may lie this far behind the nearest return: pilasters, not piles
 FAR_M = 1e9
+BESIDE_RATIO = math.tan(math.radians(60))
 
 _NEIGHBOURS = (np.arange(SECTORS)[:, None] + np.arange(-SMOOTH_SECTORS, SMOOTH_SECTORS + 1)[None, :]) % SECTORS
 
@@ -81,15 +82,20 @@ class ScanView:
         line = self._fit(distance, bearing)
         return line if line is not None else Wall(distance, bearing, False)
 
-    def ahead(self, bearing_rad: float, left_m: float, right_m: float) -> tuple[float, float]:
+    def ahead(
+        self, bearing_rad: float, left_m: float, right_m: float, beside_m: float = math.inf
+    ) -> tuple[float, float]:
         """How far one can fly that way until something lies in a lane so wide to the left and to the right, and the
-        bearing of that thing; (inf, bearing_rad) if nothing does."""
+        bearing of that thing; (inf, bearing_rad) if nothing does. What is rather beside than ahead, and farther off
+        the middle than beside_m, does not count: it is being passed."""
         c, s = math.cos(bearing_rad), math.sin(bearing_rad)
         usable = np.isfinite(self.smooth_m)
         places = np.where(usable, self.smooth_m, 0.0)[:, None] * DIRECTION
         along = places[:, 0] * c + places[:, 1] * s
         across = -places[:, 0] * s + places[:, 1] * c
         inside = usable & (along > 0) & (across < left_m) & (across > -right_m)
+        if math.isfinite(beside_m):
+            inside &= (np.abs(across) < beside_m) | (np.abs(across) < BESIDE_RATIO * along)
         if not inside.any():
             return math.inf, bearing_rad
         n = int(np.argmin(np.where(inside, along, np.inf)))

@@ -17,6 +17,7 @@ from companion.navigator.scan_view import ScanView, Wall
 
 RIGHT = -math.pi / 2
 WINDOW_RIGHT = (math.radians(-150), math.radians(20))  # where the wall on the right may be
+WINDOW_LEFT = (math.radians(30), math.radians(150))
 FRONT_RAD = math.radians(10)  # the wall ahead is fitted about the thing that stops us
 TRACK_RAD = math.radians(35)  # the wall that is turned to is looked for so near its last bearing
 ALIGNED_RAD = math.radians(3)
@@ -85,6 +86,8 @@ class WallFollower:
         self._cfg = cfg
         self._turn_rate = math.radians(cfg.turn_rate_dps)
         self._lane_left = lane_m(config)
+        self._beside_m = config.guard.stop_distance_m + 0.3
+        self._left_m = math.inf
         self.mode = FollowMode.AHEAD
         self._wall: _MapWall | None = None
         self._front_m = math.inf
@@ -98,7 +101,9 @@ class WallFollower:
     def see(self, view: ScanView, pose: Pose2) -> None:
         """Take in a new scan and the pose it was taken at."""
         # Eq. 4, as wide as the vehicle's lane.
-        self._front_m, front_rad = view.ahead(0.0, self._lane_left, LANE_RIGHT_M)
+        self._front_m, front_rad = view.ahead(0.0, self._lane_left, LANE_RIGHT_M, self._beside_m)
+        left = view.nearest(*WINDOW_LEFT)
+        self._left_m = left[0] if left is not None else math.inf
         if self.mode is FollowMode.TURN:
             self._track(view, pose)
             return
@@ -127,6 +132,8 @@ class WallFollower:
             return Steering(0.7 * speed, 0.0, -0.7 * speed / cfg.wall_distance_m, False, None, self._front_m)
         distance = self._wall.distance_m(pose)
         error = cfg.wall_distance_m - distance  # > 0: too near
+        # In a narrow place not nearer to what is on the left than a lane; in a narrower one in the middle.
+        error = min(error, max(self._left_m - self._lane_left, 0.5 * (self._left_m - distance)))
         off_parallel = wrap_angle(pose.yaw - (self._wall.normal_rad - RIGHT))  # > 0: heading away from the wall
         damping = cfg.kd_per_m * max(speed, MIN_DAMPING_MPS)
         steepest = damping * MAX_SIN_APPROACH if damping > 0 else self._turn_rate

@@ -54,16 +54,20 @@ def pilasters(width: float, depth: float) -> list[Ring]:
 
 HALLS: dict[str, list[Ring]] = {
     "cement_store": [rectangle(0, 0, 50, 30)],
-    "pilasters": [rectangle(0, 0, 50, 30), *pilasters(50, 30)],
     # A pile against the long wall, cut by the layer in a bulge that reaches 5 m into the hall.
     "leaning_pile": [rectangle(0, 0, 50, 30), [(18, 30), (20, 27), (24, 25), (28, 25.5), (31, 28), (32, 30)]],
-    "l_shaped": [[(0, 0), (60, 0), (60, 26), (34, 26), (34, 52), (0, 52)]],
+    "l_shaped": [[(0, 0), (56, 0), (56, 24), (24, 24), (24, 48), (0, 48)]],
     "columns": [
+        rectangle(0, 0, 48, 32), *pilasters(48, 32),
+        *[column(x, y, 0.6) for x in (12, 24, 36) for y in (11.5, 20.5)],
+    ],
+    "silo": [circle(16, 16, 16)],
+    # Columns at odd places: one so near the wall that D fits on neither side, one in a corner.
+    "clutter": [
         rectangle(0, 0, 60, 40),
         *[column(x, y) for x, y in [(15, 14), (30, 14), (45, 14), (15, 27), (30, 26), (45, 26), (52, 9)]],
     ],
-    "silo": [circle(0, 0, 15)],
-}
+}  # fmt: skip
 
 
 @njit(cache=True)
