@@ -193,11 +193,11 @@ class Navigator:
     # ---- on the ground ----------------------------------------------------------------------------------------------
 
     def _note_readiness(self, inputs: NavigatorInput) -> None:
-        if tuple(w.split(":")[0] for w in why) != tuple(w.split(":")[0] for w in self._not_ready):  # not each count
-        if why != self._not_ready:
-            self._not_ready = why
-            if why:
-                self._tell(Severity.NOTICE, "not_ready", "not ready: " + "; ".join(why))
+        why = not_ready(self._now, inputs)
+        news = {reason.partition(":")[0] for reason in why} != {reason.partition(":")[0] for reason in self._not_ready}
+        self._not_ready = why
+        if news and why:  # what is missing has changed, not just how much of it
+            self._tell(Severity.NOTICE, "not_ready", "not ready: " + "; ".join(why))
         if why:
             self._ready_ns = None
         elif self._ready_ns is None:
