@@ -38,6 +38,14 @@ def encode_value(value: object) -> bytes:
     return _dump(_value(value))
 
 
+def fields(data: bytes) -> dict[str, Any]:
+    """A message's fields as plain values. Raises: ValueError: not the JSON of a message."""
+    content = json.loads(data)
+    if not isinstance(content, dict):
+        raise ValueError("expected an object")
+    return content
+
+
 def decode(kind: type[T], data: bytes) -> T:
     """The message again. Raises: ValueError, KeyError, TypeError: not the JSON of such a message."""
     value: T = _decode(kind, json.loads(data))
