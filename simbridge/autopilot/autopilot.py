@@ -31,6 +31,7 @@ from simbridge.sensors import BaroSample, ImuSample
 
 STEP_S = 0.004
 DETECT_NS = 20_000_000
+REST_NS = 5_000_000_000  # disarmed this long, it counts as standing still (recorded: not yet 2.5 s after disarming)
 RANGE_STALE_NS = 500_000_000
 REBOOT_NS = 3_000_000_000  # silence while it starts again
 BOOT_PARAMS_NS = 250_000_000
@@ -105,7 +106,7 @@ class Autopilot:
         self.home_us = 0
         self._mode_flown: Mode | None = None
         self._down_mps = math.nan
-        self._next_detect_ns = 0
+        self._next_detect_ns = self._rest_ns = 0
         self._told_boot_params = False
         self._reboot_wanted = False
         self._out: list[tuple[str, bytes]] = []
@@ -238,7 +239,9 @@ class Autopilot:
         self._next_detect_ns = self.boot_ns + DETECT_NS
         armed = self.commander.is_armed
         self.land.update(self.boot_ns, self.ekf.o, self.controller, self.takeoff, armed, down_mps)
-        self.ekf.at_rest = self.land.is_landed
+        if armed or not self.land.is_landed:
+            self._rest_ns = self.boot_ns + REST_NS
+        self.ekf.at_rest = self.boot_ns >= self._rest_ns
 
     def _keep_home(self) -> None:
         """Home follows the vehicle until it takes off."""

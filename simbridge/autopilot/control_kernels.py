@@ -78,7 +78,7 @@ def velocity_control(o: Array, sp: Array, c: Array, g: Array, dt: float) -> None
         c[VEL_SP] *= g[XY_V_MAX] / speed
         c[VEL_SP + 1] *= g[XY_V_MAX] / speed
     if not math.isnan(c[VEL_SP + 2]):
-        c[VEL_SP + 2] = _clip(c[VEL_SP + 2], -c[VEL_UP], c[VEL_DOWN])
+        c[VEL_SP + 2] = max(min(c[VEL_SP + 2], c[VEL_DOWN]), -c[VEL_UP])  # the take-off ramp's limit goes first
     error = np.zeros(3)
     for i in range(3):
         ff = 0.0 if math.isnan(sp[6 + i]) else sp[6 + i]

@@ -20,7 +20,7 @@ from simbridge.sensors import BaroSample, ImuSample
 
 MS = 1_000_000
 HORIZON_NS = (kernels.RING - 1) * 8 * MS
-ATTITUDE_AFTER_NS = 1_000 * MS  # tilt alignment ends about then (recorded: between 0.99 and 1.49 s)
+ATTITUDE_AFTER_NS = 1_200 * MS  # tilt alignment ends about then (recorded: 1.0 to 1.5 s after the first datagram)
 REST_PERIOD_NS = 200 * MS
 ZERO_VELOCITY_VAR = 0.2**2 / 4  # zero_velocity_update at rest
 ZERO_GYRO_VAR = 0.01**2

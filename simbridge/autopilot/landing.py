@@ -9,8 +9,8 @@ from simbridge.autopilot.kernels import Array
 from simbridge.autopilot.params import ParamStore
 
 CONTACT_NS = 350_000_000  # GROUND_CONTACT_TRIGGER_TIME_US
-MAYBE_NS = 250_000_000  # MAYBE_LAND_DETECTOR_TRIGGER_TIME_US
-LANDED_NS = 300_000_000  # LAND_DETECTOR_TRIGGER_TIME_US
+MAYBE_NS = 400_000_000  # then the setpoint goes idle; this and the next fit the recorded landings
+LANDED_NS = 700_000_000
 LIFT_THRUST = 0.16  # share of full thrust from which "on the ground" ends during the ramp (recorded 0.8 s into it)
 
 
@@ -21,6 +21,7 @@ class LandDetector:
         self._params = params
         self.is_landed = True
         self.has_contact = True
+        self.maybe_landed = True
         self._contact_ns = -1
         self._maybe_ns = -1
         self._landed_ns = -1
@@ -31,21 +32,21 @@ class LandDetector:
         """One look, at 50 Hz. down_mps: the descent that the mode wants. Returns is_landed."""
         if not is_armed:
             if not self.is_landed and abs(o[6]) < 1.0:
-                self.is_landed = self.has_contact = True
+                self.is_landed = self.has_contact = self.maybe_landed = True
             elif self.is_landed:
                 self.has_contact = True
             return self.is_landed
         if self.is_landed:
             lifting = takeoff.state >= Takeoff.RAMP and controller.thrust > LIFT_THRUST
             if lifting:
-                self.is_landed = self.has_contact = False
+                self.is_landed = self.has_contact = self.maybe_landed = False
                 self._contact_ns = self._maybe_ns = self._landed_ns = -1
             return self.is_landed
         self.has_contact = self._held("_contact_ns", t_ns, self._contact(o, takeoff, down_mps), CONTACT_NS)
         low_thrust = controller.thrust <= self._params.real("MPC_THR_MIN") + 0.05
         still = math.hypot(o[10], o[11]) < math.radians(self._params.real("LNDMC_ROT_MAX"))
-        maybe = self._held("_maybe_ns", t_ns, self.has_contact and low_thrust and still, MAYBE_NS)
-        self.is_landed = self._held("_landed_ns", t_ns, maybe, LANDED_NS)
+        self.maybe_landed = self._held("_maybe_ns", t_ns, self.has_contact and low_thrust and still, MAYBE_NS)
+        self.is_landed = self._held("_landed_ns", t_ns, self.maybe_landed, LANDED_NS)
         return self.is_landed
 
     def _contact(self, o: Array, takeoff: Takeoff, down_mps: float) -> bool:

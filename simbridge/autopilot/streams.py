@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from simbridge.autopilot import control_kernels as k
+from simbridge.autopilot.controller import Takeoff
 from simbridge.autopilot.modes import Mode
 from simbridge.autopilot.wire import BY_NAME
 
@@ -33,7 +34,7 @@ NORMAL_HZ: dict[str, float] = {
     "SCALED_PRESSURE": 1, "SERVO_OUTPUT_RAW": 1, "SYSTEM_TIME": 1, "SYS_STATUS": 1, "VFR_HUD": 4, "VIBRATION": 0.1,
 }  # fmt: skip
 # Known to PX4, accepted by SET_MESSAGE_INTERVAL, but this emulation has nothing to say in them.
-SILENT_IDS = frozenset({8, 24, 30, 62, 65, 87, 106, 132, 290, 291, 380, 397, 410, 411, 514, 12901, 12904, 147, 36, 76})
+SILENT_IDS = frozenset({8, 24, 62, 65, 87, 106, 132, 290, 291, 380, 397, 410, 411, 514, 12901, 12904, 231})
 
 # onboard_control_sensors_*: recorded. 0x4000: horizontal position control, 0x10000000: ready to arm.
 PRESENT, ENABLED, HEALTHY, POSITION_BIT, READY_BIT = 0x300C00F, 0x301C00F, 0x320883F, 0x4000, 0x10000000
@@ -161,7 +162,7 @@ def distance_sensor(a: Autopilot) -> Values | None:
 
 def position_target(a: Autopilot) -> Values:
     sp, m = a.controller.setpoint.tolist(), a.controller.memory
-    if not a.commander.is_armed or a.land.is_landed:
+    if not a.commander.is_armed or (a.land.maybe_landed and a.takeoff.state < Takeoff.RAMP):
         return (ms(a), *[NAN] * 9, NAN, 0.0, 63, 1)
     mask = 0
     if a.commander.mode is not Mode.LAND:
