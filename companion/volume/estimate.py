@@ -7,7 +7,8 @@ from scipy import ndimage
 
 from companion.config import VolumeConfig
 from companion.messages import Array, PointMap, VolumeReport
-from companion.volume.floor import Floor, fit_floor
+from companion.volume.doubt import doubt
+from companion.volume.floor import Floor, fit_floor, level_floor
 from companion.volume.grid import Grid, Mask, cells_of, disc, grid_around
 from companion.volume.interval import Evidence, error_budget, interval
 from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells
@@ -17,12 +18,13 @@ MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
 
 
-def estimate_volume(point_map: PointMap, cfg: VolumeConfig) -> VolumeReport:
+def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float | None = None) -> VolumeReport:
     """Volume of the material above the floor and within the walls, with its interval.
 
     Args:
         point_map: in `map`, z up. A path is used when there is one (where it is free, how high was flown).
         cfg: cell size and level of the interval.
+        floor_z_m: height of a level floor, taken as exact; None: the floor is found in the map.
 
     Returns: the report. A poor map is told by `warnings` and a wide interval, never by an exception; a map that shows
         no surface at all gives volume NaN and the interval (0, inf).
@@ -44,7 +46,10 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig) -> VolumeReport:
     usable = cells.seen & (footprint.share > 0)
     if usable.sum() < 20:
         return _nothing(cfg, "the map shows no surface within the walls")
-    floor = fit_floor(grid, cells.x, cells.y, cells.z, cells.sigma_m, usable)
+    if floor_z_m is None:
+        floor = fit_floor(grid, cells.x, cells.y, cells.z, cells.sigma_m, usable)
+    else:
+        floor = level_floor(grid, floor_z_m)
     surface = build_surface(grid, cells, footprint.share > 0, strip, INTERPOLATION_REACH_M)
     return _report(point_map, cfg, grid, footprint, cells, floor, surface)
 
@@ -80,9 +85,10 @@ def _report(
         wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, 0.005)) if footprint.has_walls else 0.0,
         obstacle_area_m2=footprint.obstacle_area_m2,
     )
-    budget = error_budget(evidence)
     total = float(area.sum())
     ratio = {s: float(area[surface.state == s].sum()) / total for s in CellState}
+    doubts = doubt(evidence, footprint, cells, floor, point_map, volume, ratio[CellState.UNSEEN])
+    budget = error_budget(evidence) | {"doubt": doubts.sigma_m3}
     return VolumeReport(
         volume_m3=volume,
         interval_m3=interval(volume, budget, cfg.interval_level),
@@ -97,7 +103,7 @@ def _report(
         surface_z_m=surface.z_m,
         floor_z_m=floor_z,
         cell_state=surface.state,
-        warnings=footprint.warnings,
+        warnings=doubts.warnings,
         footprint_m=footprint.polygon_m,
         error_budget_m3=tuple(budget.items()),
     )

@@ -69,6 +69,19 @@ def fit_floor(grid: Grid, x: Array, y: Array, z: Array, sigma: Array, usable: Ma
     return _judged(grid, plane, centre, design, pz, chosen, cells, index)
 
 
+def level_floor(grid: Grid, z_m: float) -> Floor:
+    """A floor that somebody knows."""
+    return Floor(
+        plane=np.array([z_m, 0.0, 0.0]),
+        centre_m=np.zeros(2),
+        covariance=np.zeros((3, 3)),
+        cells=np.zeros(grid.shape, dtype=np.bool_),
+        undulation_m=0.0,
+        residual_m=0.0,
+        found=True,
+    )
+
+
 def _lowest_plane(design: Array, z: Array, tolerance: float) -> Array:
     """The plane with the most cells upon it and the fewest beneath it (a pile's flat top has many beneath)."""
     rng = np.random.default_rng(0)

@@ -1,0 +1,77 @@
+"""Signs that a map is degraded: what to say, and by how much to widen the interval for it.
+
+A wrong volume with a narrow interval is the worst result that this program can give: each sign that the other parts
+of the error budget cannot measure adds to it here, in m3 at 1 sigma.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.messages import PointMap
+from companion.volume.floor import Floor
+from companion.volume.interval import Evidence
+from companion.volume.surface import Cells
+from companion.volume.walls import Footprint
+
+BEYOND_WALLS = 0.03  # of all returns; an open door lets out less
+IN_THE_AIR = 0.05  # of the returns within the walls
+WALLS_DOUBLED_M = 0.06  # disagreement of keyframes on the walls; good poses keep within 0.03 m
+FLOOR_BENT_M = 0.04  # undulation; power-floated and dozed floors keep within 0.02 m
+FLOOR_SEEN = 0.03  # of the area within the walls
+UNSEEN = 0.05
+THIN_CELLS = 6.0  # returns in the median cell
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doubt:
+    sigma_m3: float
+    warnings: tuple[str, ...]
+
+
+def doubt(
+    e: Evidence, footprint: Footprint, cells: Cells, floor: Floor, point_map: PointMap, volume_m3: float, unseen: float
+) -> Doubt:
+    """All signs at once: their warnings, and what they add to the interval."""
+    area = e.grid.cell_area_m2 * e.share
+    pile_area, total = float(area[e.pile].sum()), float(area.sum())
+    said: list[str] = list(footprint.warnings)
+    extra: list[float] = []
+    if not footprint.has_walls:
+        said.append("no closed walls were found: the volume is of the map's own extent, its edge cut where returns end")
+        if len(point_map.path_map):
+            extra.append(0.05 * abs(volume_m3))
+    elif footprint.beyond_ratio > BEYOND_WALLS:
+        said.append(
+            f"{100 * footprint.beyond_ratio:.0f} % of the returns lie beyond the walls that were found: "
+            "they may be the wrong ones, or have openings"
+        )
+        extra.append(footprint.beyond_ratio * abs(volume_m3))
+    if footprint.pose_sigma_m > max(WALLS_DOUBLED_M, 3.0 * point_map.position_sigma_m):
+        said.append(
+            f"the keyframes disagree on the walls by {footprint.pose_sigma_m:.2f} m (1 sigma), "
+            f"the odometry told {point_map.position_sigma_m:.2f} m: poses are not consistent"
+        )
+    if cells.dropped_ratio > IN_THE_AIR:
+        said.append(f"{100 * cells.dropped_ratio:.0f} % of the returns were not of the surface: dust, or poor poses")
+        extra.append(0.1 * cells.dropped_ratio * abs(volume_m3))
+    floor_share = float(area[floor.cells].sum()) / total if total else 0.0
+    if not floor.found:
+        said.append("no floor could be told: the volume counts from the lowest surface seen")
+        extra.append(0.3 * pile_area)
+    elif floor_share < FLOOR_SEEN and floor.cells.any():
+        said.append(
+            f"only {100 * floor_share:.1f} % of the area within the walls shows bare floor: it may not be the floor"
+        )
+        extra.append(0.05 * pile_area)
+    if floor.undulation_m > FLOOR_BENT_M:
+        said.append(f"the floor departs from a plane by {floor.undulation_m:.2f} m (1 sigma) over a few metres")
+    if unseen > UNSEEN:
+        said.append(f"{100 * unseen:.0f} % of the floor was not seen: what lies there is guessed from its surroundings")
+    thin = float(np.median(cells.kept[cells.seen])) if cells.seen.any() else 0.0
+    if thin < THIN_CELLS:
+        said.append(f"the map is thin: {thin:.0f} returns in the median cell of {e.grid.cell_m:g} m")
+    return Doubt(sigma_m3=math.sqrt(sum(v * v for v in extra)), warnings=tuple(said))
