@@ -6,20 +6,41 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from companion.errors import ConfigError, LinkError
 from simbridge.config import SimConfig
 from simbridge.faults import LinkFaults
 from simbridge.loop import Simulation
+from simbridge.sensors import BaroSample, ImuSample
 from simbridge.server import UdpLink
 from simbridge.sitl import SitlError, parameters
 from simbridge.sitl.ardupilot import ArduPilotSitl
 from simbridge.sitl.process import AutopilotProcess, start_arducopter, start_px4
 from simbridge.sitl.px4 import Px4Sitl
 
+Array = NDArray[np.float64]
+
 COMPANION_PORT = 14540  # where PX4 sends; ArduCopter is told to
+GROUND_PORT = 14550
 PX4_OFFBOARD_PORT = 14580
+OFFBOARD_URL, GROUND_URL = f"udpin://127.0.0.1:{COMPANION_PORT}", f"udpin://127.0.0.1:{GROUND_PORT}"
 PX4_COMMANDS_PER_STEP, PX4_STEP_NS = 1, 4_000_000
 ARDUPILOT_COMMANDS_PER_STEP, ARDUPILOT_STEP_NS = 4, 5_000_000  # 800 Hz
+
+
+class RealController:
+    """A real autopilot in a Simulation: what goes wrong with it is an error of a link, for the command to tell."""
+
+    def __init__(self, sitl: Px4Sitl | ArduPilotSitl) -> None:
+        self._sitl = sitl
+
+    def step(self, t_ns: int, imu: ImuSample, baro: BaroSample | None, rangefinder_m: float | None) -> Array:
+        try:
+            return self._sitl.step(t_ns, imu, baro, rangefinder_m)
+        except SitlError as error:
+            raise LinkError(str(error)) from error
 
 
 class RealWire:
@@ -83,7 +104,7 @@ def _with_px4(cfg: SimConfig, binary: Path | None, stack: ExitStack) -> Simulati
         process = stack.enter_context(start_px4(binary, parameters.PX4 | cfg.autopilot.params))
     sitl = Px4Sitl(process=process, seed=cfg.seed)
     stack.callback(sitl.close)
-    simulation = Simulation(cfg, sitl, step_ns=PX4_STEP_NS, commands_per_step=PX4_COMMANDS_PER_STEP)
+    simulation = Simulation(cfg, RealController(sitl), step_ns=PX4_STEP_NS, commands_per_step=PX4_COMMANDS_PER_STEP)
     sitl.attach(simulation.truth)
     return simulation
 
@@ -94,9 +115,13 @@ def _with_arducopter(cfg: SimConfig, binary: Path | None, stack: ExitStack) -> S
         raise ConfigError(f"autopilot.params: {names}: are PX4's; a mission for ArduCopter has none")
     process: AutopilotProcess | None = None
     if binary is not None:
-        process = stack.enter_context(start_arducopter(binary, parameters.ARDUPILOT, offboard_port=COMPANION_PORT))
+        process = stack.enter_context(
+            start_arducopter(binary, parameters.ARDUPILOT, offboard_port=COMPANION_PORT, ground_port=GROUND_PORT)
+        )
     sitl = ArduPilotSitl(process=process)
     stack.callback(sitl.close)
-    simulation = Simulation(cfg, sitl, step_ns=ARDUPILOT_STEP_NS, commands_per_step=ARDUPILOT_COMMANDS_PER_STEP)
+    simulation = Simulation(
+        cfg, RealController(sitl), step_ns=ARDUPILOT_STEP_NS, commands_per_step=ARDUPILOT_COMMANDS_PER_STEP
+    )
     sitl.attach(simulation.truth)
     return simulation

@@ -57,10 +57,11 @@ def sim_command(
         }
         close: Callable[[], object] = lambda: None  # noqa: E731
     else:
-        from stockpilot.real_autopilot import simulation_for
+        from stockpilot.real_autopilot import GROUND_URL, OFFBOARD_URL, simulation_for
 
-        simulation, closing = simulation_for(mission.sim, autopilot, binary, speed=speed)
+        simulation, closing = simulation_for(mission.sim, autopilot, binary)
         close = closing.close
+        offboard, ground = OFFBOARD_URL, GROUND_URL  # its own sockets
     if metadata is not None:
         metadata.write_text(simulation.lidar_metadata_json(), encoding="utf-8")
     console.print(
