@@ -178,6 +178,17 @@ def outline(pile: Pile) -> Any:
             return shapely.MultiPoint(_placed_mesh(pile)[:, :, :2].reshape(-1, 2)).convex_hull
 
 
+def ragged_m(pile: Pile) -> float:
+    """How far the foot may lie outside the outline: bumps, and hills that add up."""
+    match pile:
+        case ConePile() | RidgePile():
+            return 3.0 * pile.unevenness_m / math.tan(math.radians(pile.repose_deg))
+        case GaussiansPile():
+            return 1.0
+        case FunctionPile() | MeshPile():
+            return 0.0
+
+
 def _crest(pile: ConePile | RidgePile) -> tuple[float, float]:
     return (pile.length_m, math.radians(pile.yaw_deg)) if isinstance(pile, RidgePile) else (0.0, 0.0)
 

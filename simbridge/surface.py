@@ -105,7 +105,7 @@ def _reach(pile: piles.Pile, hall: Any, gx: Array, gy: Array, cell_m: float) -> 
 
     Without this a pile that leans on the inner wall of an L would come out on the wall's other side.
     """
-    base = piles.outline(pile).buffer(2.0)  # the bumps may move the foot
+    base = piles.outline(pile).buffer(piles.ragged_m(pile))
     parts = list(getattr(base.intersection(hall), "geoms", [base.intersection(hall)]))
     middle = base.centroid
     nearest = min(parts, key=lambda part: part.distance(middle)).buffer(2.0 * cell_m)
