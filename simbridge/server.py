@@ -40,6 +40,10 @@ class UdpLink:
         self._socket.setblocking(False)
         self._socket.bind(self.local)
 
+    @property
+    def port(self) -> int:
+        return int(self._socket.getsockname()[1])
+
     def send(self, data: bytes) -> None:
         try:
             self._socket.sendto(data, self.remote)

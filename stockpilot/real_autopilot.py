@@ -16,8 +16,8 @@ from simbridge.loop import Simulation
 from simbridge.sensors import BaroSample, ImuSample
 from simbridge.server import UdpLink
 from simbridge.sitl import SitlError, parameters
-from simbridge.sitl.ardupilot import ArduPilotSitl
-from simbridge.sitl.process import AutopilotProcess, start_arducopter, start_px4
+from simbridge.sitl.ardupilot import PHYSICS_PORT, ArduPilotSitl
+from simbridge.sitl.process import start_arducopter, start_px4
 from simbridge.sitl.px4 import Px4Sitl
 
 Array = NDArray[np.float64]
@@ -65,23 +65,27 @@ class RealWire:
 
 def prepare_real(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple[Simulation, RealWire, ExitStack]:
     """World, wire and what ends them, for a flight in lockstep. Raises: ConfigError, LinkError."""
+    port = 0 if autopilot == "ardupilot" and binary is not None else COMPANION_PORT  # 0: any; it will be told
     with ExitStack() as stack:
         try:
-            link = UdpLink(remote=("127.0.0.1", PX4_OFFBOARD_PORT), local=("127.0.0.1", COMPANION_PORT))
+            link = UdpLink(remote=("127.0.0.1", PX4_OFFBOARD_PORT), local=("127.0.0.1", port))
         except OSError as error:
             raise LinkError(
                 f"UDP port {COMPANION_PORT}, where the autopilot sends, is taken ({error.strerror}): another companion?"
             ) from error
         stack.callback(link.close)
-        simulation, closing = simulation_for(cfg, autopilot, binary)
+        simulation, closing = simulation_for(cfg, autopilot, binary, companion_port=link.port)
         stack.enter_context(closing)
         return simulation, RealWire(link, cfg, lambda: simulation.liftoff_ns), stack.pop_all()
     raise AssertionError("unreachable")
 
 
-def simulation_for(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple[Simulation, ExitStack]:
+def simulation_for(
+    cfg: SimConfig, autopilot: str, binary: Path | None, *, companion_port: int = COMPANION_PORT
+) -> tuple[Simulation, ExitStack]:
     """The world with a real flight controller: started from `binary`, else waited for. Close the stack to end both.
 
+    companion_port: where an ArduCopter that we start sends its MAVLink; PX4 has its own.
     Raises: ConfigError: no such autopilot, no such binary, parameters of another. LinkError: a port is taken.
     """
     with ExitStack() as stack:
@@ -89,7 +93,7 @@ def simulation_for(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple
             if autopilot == "px4":
                 simulation = _with_px4(cfg, binary, stack)
             elif autopilot == "ardupilot":
-                simulation = _with_arducopter(cfg, binary, stack)
+                simulation = _with_arducopter(cfg, binary, stack, companion_port)
             else:
                 raise ConfigError(f"--autopilot {autopilot}: is none of emulated, px4, ardupilot")
         except SitlError as error:
@@ -99,27 +103,24 @@ def simulation_for(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple
 
 
 def _with_px4(cfg: SimConfig, binary: Path | None, stack: ExitStack) -> Simulation:
-    process: AutopilotProcess | None = None
-    if binary is not None:
-        process = stack.enter_context(start_px4(binary, parameters.PX4 | cfg.autopilot.params))
-    sitl = Px4Sitl(process=process, seed=cfg.seed)
+    sitl = Px4Sitl(seed=cfg.seed)
     stack.callback(sitl.close)
+    if binary is not None:
+        sitl.process = stack.enter_context(start_px4(binary, parameters.PX4 | cfg.autopilot.params))
     simulation = Simulation(cfg, RealController(sitl), step_ns=PX4_STEP_NS, commands_per_step=PX4_COMMANDS_PER_STEP)
     sitl.attach(simulation.truth)
     return simulation
 
 
-def _with_arducopter(cfg: SimConfig, binary: Path | None, stack: ExitStack) -> Simulation:
+def _with_arducopter(cfg: SimConfig, binary: Path | None, stack: ExitStack, companion_port: int) -> Simulation:
     if cfg.autopilot.params:
         names = ", ".join(sorted(cfg.autopilot.params))
         raise ConfigError(f"autopilot.params: {names}: are PX4's; a mission for ArduCopter has none")
-    process: AutopilotProcess | None = None
-    if binary is not None:
-        process = stack.enter_context(
-            start_arducopter(binary, parameters.ARDUPILOT, offboard_port=COMPANION_PORT, ground_port=GROUND_PORT)
-        )
-    sitl = ArduPilotSitl(process=process)
+    sitl = ArduPilotSitl(port=PHYSICS_PORT if binary is None else 0)
     stack.callback(sitl.close)
+    if binary is not None:
+        ports = {"physics_port": sitl.port, "offboard_port": companion_port, "ground_port": GROUND_PORT}
+        sitl.process = stack.enter_context(start_arducopter(binary, parameters.ARDUPILOT, **ports))
     simulation = Simulation(
         cfg, RealController(sitl), step_ns=ARDUPILOT_STEP_NS, commands_per_step=ARDUPILOT_COMMANDS_PER_STEP
     )

@@ -41,11 +41,10 @@ class ArduPilotSitl:
         host: str = "127.0.0.1",
         port: int = PHYSICS_PORT,
         connect_timeout_s: float = 60.0,
-        process: Running | None = None,
     ) -> None:
         """Listen. Raises: SitlError: the port is taken."""
         self._connect_timeout_s = connect_timeout_s
-        self._process = process
+        self.process: Running | None = None  # ours, if we started it: asked when there is silence
         self._truth: PoseSource | None = None
         self._start_m: Array | None = None
         self._physics = JsonPhysics()
@@ -131,8 +130,8 @@ class ArduPilotSitl:
             request = self._receive(0.2)
             if request is not None:
                 return request
-            if self._process is not None:
-                self._process.check()
+            if self.process is not None:
+                self.process.check()
         raise SitlError(
             f"ArduCopter did not speak to UDP port {self.port} within {self._connect_timeout_s:g} s; start it with "
             "--model JSON:127.0.0.1, or give --autopilot-binary"
@@ -157,8 +156,8 @@ class ArduPilotSitl:
         return request
 
     def _check_silence(self) -> None:
-        if self._process is not None:
-            self._process.check()
+        if self.process is not None:
+            self.process.check()
         if self._lost_s is not None and time.monotonic() - self._lost_s > self._connect_timeout_s:
             raise SitlError(f"ArduCopter has not asked for physics for {self._connect_timeout_s:g} s: it has ended")
 

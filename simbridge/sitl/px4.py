@@ -47,12 +47,11 @@ class Px4Sitl:
         port: int = SIMULATOR_PORT,
         connect_timeout_s: float = 60.0,
         answer_timeout_s: float = 10.0,
-        process: Running | None = None,
         seed: int = 0,
     ) -> None:
         """Listen. Raises: SitlError: the port is taken."""
         self._connect_timeout_s, self._answer_timeout_s = connect_timeout_s, answer_timeout_s
-        self._process = process
+        self.process: Running | None = None  # ours, if we started it: asked when there is silence
         self._truth: PoseSource | None = None
         self._noise = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(4560,))))
         self._connection: socket.socket | None = None
@@ -107,8 +106,8 @@ class Px4Sitl:
         now = time.monotonic()
         deadline = now + (self._connect_timeout_s if self._lost_s is None else self.step_ns * 1e-9)
         while not select.select([self._listener], [], [], min(0.2, max(0.0, deadline - time.monotonic())))[0]:
-            if self._process is not None:
-                self._process.check()
+            if self.process is not None:
+                self.process.check()
             if time.monotonic() >= deadline:
                 self._give_up_after(now if self._lost_s is None else self._lost_s)
                 return False
@@ -152,8 +151,8 @@ class Px4Sitl:
             elif time.monotonic() >= deadline:
                 if is_booting:
                     return
-                if self._process is not None:
-                    self._process.check()
+                if self.process is not None:
+                    self.process.check()
                 raise SitlError(
                     f"PX4 did not answer the sensors of t = {t_us / 1e6:.3f} s within {self._answer_timeout_s:g} s: it "
                     "hangs, or was not built for lockstep"
