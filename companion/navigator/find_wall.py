@@ -58,31 +58,29 @@ class WallFinder:
         self._turn_rate = math.radians(cfg.turn_rate_dps)
         self._target_yaw = 0.0
         self._away_yaw = 0.0
-        self._near_m = math.inf
+        self._lack_m = 0.0
         self._front_m = math.inf
         self.phase = Phase.LOOK
         self.wall: Wall | None = None
 
     def see(self, view: ScanView, pose: Pose2, islands: tuple[Island, ...]) -> None:
         """Take in a new scan and the pose it was taken at."""
-        near = view.nearest(-math.pi, math.pi)
-        if near is None:
+        standing = free_standing(view.smooth_m) | within(view.smooth_m, pose, islands)
+        around = _nearest(view.smooth_m)
+        wall = _nearest(np.where(standing, np.inf, view.smooth_m)) or around
+        if around is None or wall is None:
             self.phase = Phase.LOOK
             return
-        self._near_m = near[0]
+        if self.phase in (Phase.LOOK, Phase.RETREAT):
+            self._make_room(view, pose, around, wall)
         if self.phase is Phase.LOOK:
-            self._look(view, pose, islands)
-        if self.phase is Phase.RETREAT:
-            self._away_yaw = wrap_angle(pose.yaw + near[1] + math.pi)
-            room, _ = view.ahead(near[1] + math.pi, 0.5 * self._lane, 0.5 * self._lane)
-            if self._near_m >= self._cfg.wall_distance_m - 0.2 or room < max(self._near_m, self._lane) + 0.3:
-                self._found(view, near[1])
+            self._choose(view, pose, standing)
         elif self.phase is Phase.APPROACH:
             self._front_m, front = view.ahead(0.0, self._lane, self._lane)
             if self._front_m <= self._cfg.wall_distance_m + TURN_MARGIN_M:
                 self._found(view, front)
-            elif self._near_m < self._cfg.wall_distance_m - TOO_NEAR_M:
-                self._found(view, near[1])
+            elif wall[0] < self._cfg.wall_distance_m - TOO_NEAR_M:
+                self._found(view, wall[1])
 
     def step(self, pose: Pose2, speed_mps: float) -> Steering:
         """What to do now at most at this speed."""
@@ -91,7 +89,7 @@ class WallFinder:
         if self.phase is Phase.ORIENT and abs(off) < FACING_RAD:
             self.phase = Phase.APPROACH
         if self.phase is Phase.RETREAT:
-            speed = min(speed_mps, 0.1 + 0.4 * max(0.0, self._cfg.wall_distance_m - self._near_m))
+            speed = min(speed_mps, 0.1 + 0.4 * self._lack_m)
             bearing = self._away_yaw - pose.yaw
             return self._steer(speed * math.cos(bearing), speed * math.sin(bearing), 0.0)
         if self.phase is Phase.ORIENT:
@@ -101,11 +99,27 @@ class WallFinder:
             return self._steer(min(speed_mps, max(0.05, brake)), 0.0, turn)
         return self._steer(0.0, 0.0, 0.0)
 
-    def _look(self, view: ScanView, pose: Pose2, islands: tuple[Island, ...]) -> None:
-        if self._near_m < self._cfg.wall_distance_m - TOO_NEAR_M:
-            self.phase = Phase.RETREAT
+    def _make_room(self, view: ScanView, pose: Pose2, around: tuple[float, float], wall: tuple[float, float]) -> None:
+        """Back off from a wall nearer than D, from anything else nearer than a lane; one may then be at the wall."""
+        retreating = self.phase is Phase.RETREAT
+        lack = self._cfg.wall_distance_m - (0.2 if retreating else TOO_NEAR_M) - wall[0]
+        crowd = self._lane - (0.0 if retreating else 0.3) - around[0]
+        if lack <= 0.0 and crowd <= 0.0:
+            self.phase = Phase.LOOK
+            if retreating and wall[0] < self._cfg.wall_distance_m + TOO_NEAR_M:
+                self._found(view, wall[1])
             return
-        bearing = wall_bearing(view, pose, self._lane, islands)
+        near = around if crowd > 0.0 else wall
+        room, _ = view.ahead(near[1] + math.pi, 0.5 * self._lane, 0.5 * self._lane)
+        if room < max(near[0], self._lane) + 0.3:  # as near on the other side
+            self._found(view, wall[1])
+            return
+        self.phase = Phase.RETREAT
+        self._away_yaw = wrap_angle(pose.yaw + near[1] + math.pi)
+        self._lack_m = max(lack, crowd)
+
+    def _choose(self, view: ScanView, pose: Pose2, standing: NDArray[np.bool_]) -> None:
+        bearing = wall_bearing(view, self._lane, standing)
         if bearing is not None:
             self._target_yaw = wrap_angle(pose.yaw + bearing)
             self._front_m, _ = view.ahead(bearing, self._lane, self._lane)
@@ -120,13 +134,11 @@ class WallFinder:
         return Steering(forward, left, yaw_rate, False, None, self._front_m)
 
 
-def wall_bearing(view: ScanView, pose: Pose2, lane_m: float, islands: tuple[Island, ...]) -> float | None:
+def wall_bearing(view: ScanView, lane_m: float, standing: NDArray[np.bool_]) -> float | None:
     """Body bearing of the shortest free lane to a wall; None if nothing is seen.
 
-    Free-standing things (both ends in front of something far behind, or gone round before) are no walls, unless there
-    is nothing else.
+    standing: (360,) sectors that show free-standing things: those are no walls, unless there is nothing else.
     """
-    standing = free_standing(view.smooth_m) | _within(view.smooth_m, pose, islands)
     best: tuple[bool, float, float] | None = None
     for n in range(0, SECTORS, TRIED_DEG):
         distance, hit_rad = view.ahead(float(BEARING_RAD[n]), lane_m, lane_m)
@@ -171,7 +183,13 @@ def _without_holes(ranges: Array) -> Array:
     return filled
 
 
-def _within(ranges: Array, pose: Pose2, islands: tuple[Island, ...]) -> NDArray[np.bool_]:
+def _nearest(ranges: Array) -> tuple[float, float] | None:
+    n = int(np.argmin(ranges))
+    return (float(ranges[n]), float(BEARING_RAD[n])) if math.isfinite(ranges[n]) else None
+
+
+def within(ranges: Array, pose: Pose2, islands: tuple[Island, ...]) -> NDArray[np.bool_]:
+    """(360,) True where a return lies on something that was gone round before."""
     out = np.zeros(SECTORS, dtype=np.bool_)
     finite = np.isfinite(ranges)
     reach = np.where(finite, ranges, 0.0)

@@ -292,8 +292,8 @@ def _still(t_ns: int, kind: SetpointKind, reason: str) -> Setpoint:
 
 
 def _sigma_m(estimate: OdometryEstimate) -> float:
-    variance = float(max(estimate.pose_covariance[0, 0], estimate.pose_covariance[1, 1]))
-    return math.sqrt(variance) if variance >= 0 and math.isfinite(variance) else math.inf
+    x, y = float(estimate.pose_covariance[0, 0]), float(estimate.pose_covariance[1, 1])
+    return math.sqrt(max(x, y)) if x >= 0 and y >= 0 and math.isfinite(x + y) else math.inf  # NaN is not >= 0
 
 
 def _is_good(estimate: OdometryEstimate, t_ns: int) -> bool:

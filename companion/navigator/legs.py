@@ -26,6 +26,7 @@ STUCK_M = 1.0
 AT_HOME_M = 0.2
 NEAR_HOME_M = 0.9  # near enough, when it comes no nearer: something stands by the start
 NO_NEARER_S = 6.0
+MIN_WALL_SHARE = 0.2  # of a lap, in time, along something that has a line; a silo's wall has one, columns have none
 HANDOVER_M = 1.5  # above the start: from here down the flight controller's own land mode
 
 
@@ -111,6 +112,7 @@ class Round:
         self._follower = WallFollower(config)
         self._lap = LapTracker()
         self._stuck = StuckWatch(config.navigator)
+        self._steps, self._steps_along_wall = 0, 0
         self.is_straight = False
 
     @property
@@ -126,6 +128,7 @@ class Round:
         """Count a new lap from here."""
         self._lap = LapTracker()
         self._stuck = StuckWatch(self._cfg)
+        self._steps, self._steps_along_wall = 0, 0
 
     def island(self) -> Island:
         """What the path so far went round."""
@@ -138,11 +141,15 @@ class Round:
             self._follower.see(now.view, now.view_pose)
         steering = self._follower.step(now.pose, _speed(self._cfg, now))
         self.is_straight = steering.is_straight
+        self._steps += 1
+        self._steps_along_wall += steering.is_along_wall
         up = climb_rate(now.z_m - self._start.z, self._cfg.height_m, HEIGHT_KEEPING_MPS)
         motion = steered(steering, now.pose, up)
         lap = self._lap.add(now.pose)
-        if lap is not Lap.OPEN:
-            return motion, Ending.ARRIVED if lap is Lap.CLOSED else Ending.ISLAND
+        if lap is Lap.CLOSED and self._steps_along_wall > MIN_WALL_SHARE * self._steps:
+            return motion, Ending.ARRIVED
+        if lap is not Lap.OPEN:  # round a column, or round and round among columns
+            return motion, Ending.ISLAND
         return motion, Ending.FAILED if self._stuck.step(now) else None
 
 

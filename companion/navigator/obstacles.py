@@ -57,7 +57,7 @@ class Surroundings:
     def limit(self, velocity_xy: Array, x: float, y: float, t_ns: int) -> tuple[Array, str]:
         """The velocity with what leads too near to something taken off, and why; never faster than it came."""
         speed = float(np.hypot(*velocity_xy))
-        if speed < 1e-6:
+        if speed == 0.0:
             return np.zeros(2), ""
         fresh = t_ns - self._place_ns <= NEAR_REMEMBERED_NS
         if int(np.count_nonzero(fresh)) < MIN_SEEN:
@@ -69,7 +69,7 @@ class Surroundings:
         direction = off[near] / np.maximum(distance[near], 1e-9)[:, None]
         limit = allowed_speed(distance[near] - self._stop, self._deceleration)
         velocity, why = _slide(velocity_xy, direction, limit)
-        if float(np.hypot(*velocity)) > 1e-6 and self._is_blind(velocity, t_ns):
+        if velocity.any() and self._is_blind(velocity, t_ns):
             return np.zeros(2), "nobody looked that way"
         return velocity, why
 

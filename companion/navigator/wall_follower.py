@@ -55,7 +55,10 @@ class Pose2:
 
 @dataclass(frozen=True, slots=True)
 class Steering:
-    """Velocity forward and to the left in the body's heading, and turn rate. right_m, front_m: what it was based on."""
+    """Velocity forward and to the left in the body's heading, and turn rate. right_m, front_m: what it was based on.
+
+    is_along_wall: what is followed is a wall with a line, and not a column or a corner.
+    """
 
     forward_mps: float
     left_mps: float
@@ -63,6 +66,7 @@ class Steering:
     is_straight: bool
     right_m: float | None
     front_m: float
+    is_along_wall: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,7 @@ class _MapWall:
 
     normal_rad: float
     offset_m: float
+    is_line: bool
     is_straight: bool
 
     def distance_m(self, pose: Pose2) -> float:
@@ -142,7 +147,8 @@ class WallFollower:
         forward = speed * (1.0 if abs(off_parallel) < math.radians(25) else 0.4)
         side = _clamp(SIDE_GAIN_PER_S * error, min(MAX_SIDE_MPS, 0.5 * speed_mps))
         straight = self._wall.is_straight and abs(off_parallel) < math.radians(10)
-        return Steering(forward, side, _clamp(yaw_rate, self._turn_rate), straight, distance, self._front_m)
+        rate = _clamp(yaw_rate, self._turn_rate)
+        return Steering(forward, side, rate, straight, distance, self._front_m, self._wall.is_line)
 
     def _turn(self, left_to_turn: float, pose: Pose2) -> Steering:
         """On the spot, but for the drift that keeps D to the wall that is turned to."""
@@ -169,7 +175,7 @@ class WallFollower:
 def _in_map(wall: Wall, pose: Pose2) -> _MapWall:
     normal = wrap_angle(wall.normal_rad + pose.yaw)
     offset = math.cos(normal) * pose.x + math.sin(normal) * pose.y + wall.distance_m
-    return _MapWall(normal, offset, wall.is_line and min(wall.ends_m) > STRAIGHT_M)
+    return _MapWall(normal, offset, wall.is_line, wall.is_line and min(wall.ends_m) > STRAIGHT_M)
 
 
 def _clamp(value: float, limit: float) -> float:

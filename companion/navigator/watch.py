@@ -78,8 +78,8 @@ class VisionWatch:
             return "the estimate is not finite"
         if estimate.quality < 0:
             return "registration failed"
-        variance = max(estimate.pose_covariance[0, 0], estimate.pose_covariance[1, 1])
-        if not variance <= self._guard.max_position_sigma_m**2:
+        variances = estimate.pose_covariance[[0, 1], [0, 1]]
+        if not np.all((variances >= 0) & (variances <= self._guard.max_position_sigma_m**2)):
             return "the position is uncertain"
         return ""
 
