@@ -39,9 +39,9 @@ class Frame:
 class Decoder:
     """Finds frames in a stream of bytes: steps over plain text and damage, and takes up again at the next frame."""
 
-    def __init__(self) -> None:
+    def __init__(self, dropped: Counter[str] | None = None) -> None:
         self._buffer = b""
-        self.dropped: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter() if dropped is None else dropped
 
     def receive(self, data: bytes) -> list[Frame]:
         """All frames that are complete by now. A cut frame waits for its rest."""
@@ -61,7 +61,7 @@ class Decoder:
                 at += size
             else:
                 self.dropped[reason] += 1
-                at += size if reason == "unknown_id" and _looks_like_a_start(buffer, at + size) else 1
+                at += 1  # its length cannot be believed either: a good frame may lie within
         self._buffer = buffer[at:]
         return frames
 
@@ -72,10 +72,6 @@ def _next_magic(buffer: bytes, at: int) -> int:
     if one >= 0:
         return one
     return two if two >= 0 else len(buffer)
-
-
-def _looks_like_a_start(buffer: bytes, at: int) -> bool:
-    return at == len(buffer) or buffer[at] in (_MAGIC_1, _MAGIC_2)
 
 
 def _frame_size(buffer: bytes, at: int) -> int | None:

@@ -212,12 +212,13 @@ class Hearing:
     def _on_extended_state(self, payload: bytes, t_ns: int) -> None:
         _, landed = wire.unpack(wire.EXTENDED_SYS_STATE, payload)
         self.vehicle.landed_state = LandedState(landed) if landed <= LandedState.LANDING else LandedState.UNDEFINED
+        self.vehicle.t_landed_ns = t_ns
         self._update_mode(t_ns)
 
     def _on_current_mode(self, payload: bytes, t_ns: int) -> None:
         custom_mode, _, standard_mode = wire.unpack(wire.CURRENT_MODE, payload)
         self.vehicle.standard_mode = (custom_mode, standard_mode)
-        self.vehicle.custom_mode = custom_mode  # sooner than the heartbeat, which comes once a second
+        self.vehicle.note_custom_mode(custom_mode, t_ns)  # sooner than the heartbeat, which comes once a second
         self._update_mode(t_ns)
 
     def _update_mode(self, t_ns: int) -> None:

@@ -81,7 +81,7 @@ class Heartbeats:
         the estimate is weak or failed, and stops when everything stands still: then it is the program that hangs."""
         if t_ns < self.t_next_ns:
             return []
-        is_late = t_ns - self.t_next_ns > PERIOD_NS
+        is_late = t_ns - self.t_next_ns >= PERIOD_NS
         self.t_next_ns = (t_ns if is_late else self.t_next_ns) + PERIOD_NS
         out: list[tuple[int, bytes]] = []
         if not signs.stale(t_ns):

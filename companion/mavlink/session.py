@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable
 
 from companion.config import MavlinkConfig
@@ -46,6 +47,7 @@ _MODE_OF_REQUEST = {
 }
 _NEEDS_CONTROL = (RequestKind.ARM, RequestKind.OFFBOARD)
 _POSITION_AGE_NS = 1_000_000_000
+_MAX_SENDERS = 16
 
 
 class MavlinkSession:
@@ -58,7 +60,8 @@ class MavlinkSession:
 
     def __init__(self, cfg: MavlinkConfig, *, signer: Signer | None = None) -> None:
         self._system = cfg.system_id
-        self._decoder = Decoder()
+        self._frames_dropped: Counter[str] = Counter()
+        self._decoders: dict[Hashable | None, Decoder] = {}
         self._signer = signer
         self._outbox = Outbox(cfg.system_id, signer)
         self._sources = Sources(cfg.system_id)
@@ -90,7 +93,7 @@ class MavlinkSession:
         self._journal.t_ns = t_ns
         out: list[Received] = []
         changed = False
-        for frame in self._decoder.receive(data):
+        for frame in self._decoder(source).receive(data):
             reason = self._signer.refusal(frame, t_ns) if self._signer is not None else None
             reason = reason or self._sources.judge(frame, source)
             if reason is not None:
@@ -105,6 +108,15 @@ class MavlinkSession:
         if changed or events:
             out.append(self.vehicle_state(t_ns))
         return out
+
+    def _decoder(self, source: Hashable | None) -> Decoder:
+        """One for each sender: half a frame of a stranger must not hold up the autopilot's."""
+        decoder = self._decoders.get(source)
+        if decoder is None:
+            if len(self._decoders) >= _MAX_SENDERS:
+                self._decoders.clear()
+            decoder = self._decoders[source] = Decoder(self._frames_dropped)
+        return decoder
 
     def poll(self, t_ns: int) -> None:
         """Do what is due: heartbeats, time sync, origin, retries, the watch over the link."""
@@ -271,7 +283,7 @@ class MavlinkSession:
     @property
     def counts(self) -> dict[str, int]:
         """What was dropped, refused and held back since the start, by reason."""
-        parts = (("frame", self._decoder.dropped), ("refused", self._sources.refused), ("vision", self._vision.refused))
+        parts = (("frame", self._frames_dropped), ("refused", self._sources.refused), ("vision", self._vision.refused))
         return {f"{part}.{reason}": n for part, counter in parts for reason, n in sorted(counter.items()) if n}
 
     def vehicle_state(self, t_ns: int) -> VehicleState:

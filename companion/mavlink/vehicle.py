@@ -24,7 +24,9 @@ class Vehicle:
     is_armed: bool = False
     system_status: int = 0
     mode: FlightMode = FlightMode.UNKNOWN
+    t_custom_mode_ns: int = 0  # when custom_mode last changed
     landed_state: LandedState = LandedState.UNDEFINED
+    t_landed_ns: int = 0
     standard_mode: tuple[int, int] | None = None  # (custom_mode, MAV_STANDARD_MODE)
     estimator_flags: int | None = None
     t_estimator_ns: int | None = None
@@ -51,8 +53,12 @@ class Vehicle:
         self.system_status = system_status
         was_armed, self.is_armed = self.is_armed, bool(base_mode & _ARMED)
         events = self._arming_events(was_armed, t_ns)
-        self.custom_mode = custom_mode
+        self.note_custom_mode(custom_mode, t_ns)
         return events + self.update_mode(dialect, t_ns)
+
+    def note_custom_mode(self, custom_mode: int, t_ns: int) -> None:
+        if custom_mode != self.custom_mode:
+            self.custom_mode, self.t_custom_mode_ns = custom_mode, t_ns
 
     def _arming_events(self, was_armed: bool, t_ns: int) -> list[Event]:
         if was_armed == self.is_armed:
@@ -65,9 +71,10 @@ class Vehicle:
     def update_mode(self, dialect: Dialect, t_ns: int) -> list[Event]:
         """Work the mode out again, after anything that it hangs on has changed."""
         standard = self.standard_mode
+        is_landed_news = self.t_landed_ns > self.t_custom_mode_ns  # an older one is of the mode before
         report = ModeReport(
             custom_mode=self.custom_mode,
-            landed_state=self.landed_state,
+            landed_state=self.landed_state if is_landed_news else LandedState.UNDEFINED,
             standard_mode=standard[1] if standard is not None and standard[0] == self.custom_mode else None,
         )
         before, self.mode = self.mode, dialect.decode_mode(report)
