@@ -35,12 +35,14 @@ class RealController:
 
     def __init__(self, sitl: Px4Sitl | ArduPilotSitl) -> None:
         self._sitl = sitl
+        self.motors: Array = np.zeros(4)  # the newest commands, 0..1
 
     def step(self, t_ns: int, imu: ImuSample, baro: BaroSample | None, rangefinder_m: float | None) -> Array:
         try:
-            return self._sitl.step(t_ns, imu, baro, rangefinder_m)
+            self.motors = self._sitl.step(t_ns, imu, baro, rangefinder_m)
         except SitlError as error:
             raise LinkError(str(error)) from error
+        return self.motors
 
 
 class RealWire:

@@ -148,7 +148,7 @@ def test_silence_in_flight_is_motors_off_and_a_restart_goes_on(
 def test_no_arducopter_is_told_with_what_to_do(pose: StandingPose) -> None:
     backend = ArduPilotSitl(port=0, connect_timeout_s=0.1)
     backend.attach(lambda: pose)
-    with pytest.raises(SitlError, match="did not speak to UDP port .* --autopilot-binary"):
+    with pytest.raises(SitlError, match=r"did not speak to UDP port .* --autopilot-binary"):
         backend.step(1_000_000_000, REST, None, None)
     backend.close()
 

@@ -88,12 +88,16 @@ def test_rates_are_250_hz_sensors_20_hz_rangefinder_1_hz_heartbeat() -> None:
 
 
 def test_rangefinder_looks_down_and_speaks_centimetres() -> None:
-    message = next(m for m in sent(HilLink().sensor_frames(STEP_NS, REST, None, 1.237)) if m.get_type() == "DISTANCE_SENSOR")
+    message = next(
+        m for m in sent(HilLink().sensor_frames(STEP_NS, REST, None, 1.237)) if m.get_type() == "DISTANCE_SENSOR"
+    )
     assert (message.current_distance, message.orientation, message.signal_quality) == (124, 25, 100)
 
 
 def test_no_return_of_the_rangefinder_is_an_invalid_signal() -> None:
-    message = next(m for m in sent(HilLink().sensor_frames(STEP_NS, REST, None, None)) if m.get_type() == "DISTANCE_SENSOR")
+    message = next(
+        m for m in sent(HilLink().sensor_frames(STEP_NS, REST, None, None)) if m.get_type() == "DISTANCE_SENSOR"
+    )
     assert message.signal_quality == 1
     assert message.current_distance > message.max_distance
 

@@ -75,7 +75,7 @@ def test_a_binary_that_is_none_is_told(tmp_path: Path) -> None:
 
 
 def test_px4_without_its_start_scripts_is_told(tmp_path: Path) -> None:
-    with pytest.raises(SitlError, match="no etc/init.d-posix beside it"):
+    with pytest.raises(SitlError, match=r"no etc/init\.d-posix beside it"):
         start_px4(script(tmp_path / "px4", "exit 0"), {})
 
 

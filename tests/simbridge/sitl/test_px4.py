@@ -98,9 +98,10 @@ def test_px4_hears_what_the_recorded_px4_heard(sitl: Px4Sitl) -> None:
 
 def test_a_px4_that_falls_silent_is_told_with_its_time(sitl: Px4Sitl) -> None:
     RecordedPx4(sitl.port, silent_after_us=1_200_000).start()
+    for i in range(50):  # up to 1.2 s
+        step(sitl, i)
     with pytest.raises(SitlError, match=r"t = 1\.204 s within 0\.3 s"):
-        for i in range(100):
-            step(sitl, i)
+        step(sitl, 50)
 
 
 def test_px4_gone_means_motors_off_and_back_means_lockstep_again(sitl: Px4Sitl) -> None:
@@ -121,7 +122,7 @@ def test_px4_gone_means_motors_off_and_back_means_lockstep_again(sitl: Px4Sitl) 
 
 def test_no_px4_is_told_with_what_to_do() -> None:
     backend = Px4Sitl(port=0, connect_timeout_s=0.1)
-    with pytest.raises(SitlError, match="did not connect to TCP port .* --autopilot-binary"):
+    with pytest.raises(SitlError, match=r"did not connect to TCP port .* --autopilot-binary"):
         step(backend, 0)
     backend.close()
 

@@ -1,0 +1,136 @@
+"""Whole flights on real PX4 and ArduCopter, in lockstep: minutes each, and only where their binaries are given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.messages import FlightMode
+from simbridge.link_frames import message_id
+from stockpilot.lockstep import Lockstep
+from stockpilot.mission import load_mission
+from stockpilot.run import Prepared, prepare
+from tests.simbridge.sitl.real_binaries import BOTH, real_binary
+
+MISSION = Path(__file__).resolve().parents[2] / "missions" / "cement_store.yaml"
+ODOMETRY, SETPOINT, ORIGIN = 331, 84, 48
+pytestmark = pytest.mark.timeout(1800)
+
+
+class Cut:
+    """A wire that loses some of the companion's messages."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self._wire = prepared.wire
+        self.lost: frozenset[int] = frozenset()
+        self.is_companion_dead = False
+
+    def take(self, t_ns: int) -> list[bytes]:
+        return self._wire.take(t_ns)
+
+    def send(self, frames: list[bytes], t_ns: int) -> None:
+        kept = [] if self.is_companion_dead else [f for f in frames if message_id(f) not in self.lost]
+        self._wire.send(kept, t_ns)
+
+
+def runner(kind: str) -> tuple[Prepared, Lockstep, Cut]:
+    prepared = prepare(load_mission(MISSION, [], seed=0), autopilot=kind, binary=real_binary(kind))
+    wire = Cut(prepared)
+    return prepared, Lockstep(simulation=prepared.simulation, wire=wire, flight=prepared.flight), wire
+
+
+def fly_until(run: Lockstep, seconds_after_liftoff: float, limit_s: float = 300.0) -> None:
+    while (off := run.simulation.liftoff_ns) is None or run.simulation.t_ns < off + seconds_after_liftoff * 1e9:
+        run.step()
+        assert run.simulation.t_ns < limit_s * 1e9
+
+
+def seconds_until(run: Lockstep, mode: FlightMode, limit_s: float) -> float:
+    began_ns = run.simulation.t_ns
+    while run.flight.session.vehicle_state(run.t_ns).mode is not mode:
+        run.step()
+        assert run.simulation.t_ns < began_ns + limit_s * 1e9, f"not in {mode} after {limit_s} s"
+    return (run.simulation.t_ns - began_ns) * 1e-9
+
+
+def land(run: Lockstep, limit_s: float) -> None:
+    began_ns = run.simulation.t_ns
+    while run.flight.session.vehicle_state(run.t_ns).is_armed:
+        run.step()
+        assert not run.simulation.collision
+        assert run.simulation.t_ns < began_ns + limit_s * 1e9
+    assert np.linalg.norm(run.simulation.truth().velocity_world_mps) < 0.2
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_cement_store_is_flown_from_arming_to_landing(kind: str) -> None:
+    prepared, run, _ = runner(kind)
+    with prepared.closing:
+        fly_until(run, 25.0)
+        controls = []
+        for _ in range(500):
+            run.step()
+            controls.append(prepared.simulation._autopilot.motors)
+        outcome = run.run()
+    assert (outcome.state, prepared.simulation.collision) == ("completed", False), outcome.reason
+    assert np.mean(controls) == pytest.approx(0.52, abs=0.02)  # hover, as measured with both
+    assert prepared.simulation.min_clearance_m > 1.0
+    assert outcome.odometry_max_gap_s < 0.1
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_vision_lost_in_flight_ends_on_the_ground(kind: str) -> None:
+    """PX4 descends after 4.6 s (measured 4.56 to 4.66), its heartbeat is 1 Hz; ArduPilot lands after 8.0 s."""
+    prepared, run, wire = runner(kind)
+    with prepared.closing:
+        fly_until(run, 30.0)
+        wire.lost = frozenset({ODOMETRY})
+        if kind == "px4":
+            assert 4.4 < seconds_until(run, FlightMode.DESCEND, 10.0) < 7.0
+        else:
+            assert seconds_until(run, FlightMode.LAND, 10.0) < 9.5
+        land(run, 60.0)
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_setpoints_lost_in_flight_end_on_the_ground(kind: str) -> None:
+    """PX4 lands by itself after 1.0 to 1.5 s; ArduPilot stands still after 3 s and says nothing."""
+    prepared, run, wire = runner(kind)
+    with prepared.closing:
+        fly_until(run, 30.0)
+        wire.lost = frozenset({SETPOINT})
+        if kind == "px4":
+            assert seconds_until(run, FlightMode.LAND, 5.0) < 2.6
+            land(run, 60.0)
+        else:
+            began_ns = run.simulation.t_ns
+            while run.simulation.t_ns < began_ns + 6e9:
+                run.step()
+            assert np.linalg.norm(run.simulation.truth().velocity_world_mps) < 0.2
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_companion_killed_in_flight_ends_on_the_ground(kind: str) -> None:
+    prepared, run, wire = runner(kind)
+    with prepared.closing:
+        fly_until(run, 30.0)
+        wire.is_companion_dead = True
+        land(run, 90.0)
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_origin_that_comes_late_still_comes_before_vision(kind: str) -> None:
+    prepared, run, wire = runner(kind)
+    with prepared.closing:
+        wire.lost = frozenset({ORIGIN})
+        while run.simulation.t_ns < 25e9:
+            run.step()
+            assert not prepared.flight.session.vehicle_state(run.t_ns).is_ready_to_arm
+        wire.lost = frozenset()
+        fly_until(run, 15.0)
+        state = prepared.flight.session.vehicle_state(run.t_ns)
+    assert state.position_map_m is not None
+    assert prepared.flight.estimate is not None
+    assert np.linalg.norm(state.position_map_m - prepared.flight.estimate.position_map_m) < 1.0
