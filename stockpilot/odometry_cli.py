@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from companion.errors import FileFormatError
-from companion.messages import Array
+from companion.messages import Array, PointMap
 from companion.recording.tum import seconds
 from stockpilot.scan_files import FileScan, ScanFile, open_scans
 
@@ -74,20 +74,24 @@ def _has_moved(last: Array | None, pose: Array) -> bool:
 
 def _placed(points_3d: Array, pose: Array) -> Array:
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    placed = points_3d @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    placed: Array = points_3d @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     placed[:, :2] += pose[:2]
     return placed
 
 
-def write_map(path: Path, points: list[Array]) -> int:
+def write_map(path: Path, found: Track) -> int:
     """One point for each 5 cm, as PLY or LAS/LAZ by the name's end; returns how many."""
-    every = np.concatenate(points) if points else np.zeros((0, 3))
+    from companion.mapping.export import save_point_map
+
+    every = np.concatenate(found.map_points) if found.map_points else np.zeros((0, 3))
     _, first = np.unique(np.floor(every / MAP_CELL_M).astype(np.int64), axis=0, return_index=True)
     kept = every[np.sort(first)]
-    from companion.mapping.export import save_points
-
+    flown = np.column_stack([np.array([p[:2] for p in found.poses]), np.zeros(len(found.poses))])
+    nothing = np.zeros(len(kept))
     try:
-        save_points(kept, path)
+        save_point_map(
+            PointMap(points_map=kept, keyframe_id=nothing.astype(np.int64), range_m=nothing, path_map=flown), path
+        )
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be written: {error.strerror}") from None
     return len(kept)
@@ -121,7 +125,7 @@ def odometry_command(
         said["tum"] = str(tum)
     if map_out is not None:
         said["map"] = str(map_out)
-        said["map_points"] = write_map(map_out, found.map_points)
+        said["map_points"] = write_map(map_out, found)
     typer.echo(json.dumps(said, indent=2) if as_json else describe(said))
     raise typer.Exit(0 if said["placed_ratio"] >= 0.5 else 1)
 

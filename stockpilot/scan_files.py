@@ -92,13 +92,14 @@ def scan_from_points(t_ns: int, points_3d: Array) -> FileScan:
     return FileScan(t_ns=t_ns, points=points_3d[near, :2].copy(), points_3d=points_3d)
 
 
-def scan_from_lidar(scan: LidarScan) -> FileScan:
-    """An Ouster scan: the horizontal row makes the planar one."""
+def scan_from_lidar(scan: LidarScan, decoder: OusterDecoder) -> FileScan:
+    """An Ouster scan: the horizontal row makes the planar one. Its time is the sensor's own, of the last column."""
     geometry = scan.geometry
     points = geometry.directions * scan.range_m[..., None].astype(np.float64) + geometry.offsets_m
     seen = scan.range_m > 0
     row = geometry.horizontal_row
-    return FileScan(t_ns=scan.t_ns, points=points[row][seen[row]][:, :2].copy(), points_3d=points[seen])
+    t_ns = scan.t_ns - (decoder.clock.offset_ns or 0)
+    return FileScan(t_ns=t_ns, points=points[row][seen[row]][:, :2].copy(), points_3d=points[seen])
 
 
 def beam_step(count: int, step_rad: float) -> float:
@@ -147,7 +148,7 @@ def _first(packets: PcapReader, count: int) -> Iterator[Any]:
 def _ouster_scans(path: Path, decoder: OusterDecoder) -> Iterator[FileScan]:
     for packet in PcapReader(path):
         for scan in decoder.receive(packet.data, packet.t_ns, packet.source):
-            yield scan_from_lidar(scan)
+            yield scan_from_lidar(scan, decoder)
 
 
 def _velodyne_scans(path: Path) -> Iterator[FileScan]:
@@ -188,7 +189,7 @@ def _own_scans(path: Path, decoder: OusterDecoder) -> Iterator[FileScan]:
         if isinstance(item, Message) and item.channel.topic == channels.INPUT_PREFIX + "lidar":
             raw = channels.unpack_raw(item.data)
             for scan in decoder.receive(raw.data, item.t_ns, raw.source):
-                yield scan_from_lidar(scan)
+                yield scan_from_lidar(scan, decoder)
 
 
 def _ros_mcap(scan: McapScan, path: Path, topic: str | None) -> Iterator[FileScan]:
