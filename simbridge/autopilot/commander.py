@@ -61,6 +61,7 @@ class Commander:
         self._override_since_ns = -1
         self._warned = 0
         self._was_landed = True
+        self._told: set[str] = set()
 
     # what may be
 
@@ -172,6 +173,7 @@ class Commander:
             return False
         self._next_ns = t_ns + PERIOD_NS
         self._watch_landing(t_ns)
+        self._tell_preflight()
         self._watch_battery()
         self._watch_ground_station()
         self._decide()
@@ -208,6 +210,21 @@ class Commander:
             action = _LINK_LOSS.get(self._params.integer("NAV_RCL_ACT"), Mode.LOITER)
         first = _LADDER.index(action) if action in _LADDER else 0
         return next(m for m in _LADDER[first:] if self.can_run(m))
+
+    def _tell_preflight(self) -> None:
+        """The estimator's preflight complaints, each once after boot."""
+        if self.is_armed or not self._ekf.attitude_valid:
+            return
+        for text, fails in (
+            ("Preflight Fail: no heading reference", not self._ekf.vision.yaw_aligned),
+            (
+                "Preflight Fail: horizontal position unstable",
+                self._ekf.xy_valid and not self._ekf.vision.stable(self.now_ns),
+            ),
+        ):
+            if fails and text not in self._told:
+                self._told.add(text)
+                self._tell(CRITICAL, text)
 
     def _watch_landing(self, t_ns: int) -> None:
         landed = self._land.is_landed

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 NAN = math.nan
 _SETPOINT = "SET_POSITION_TARGET_LOCAL_NED"
 _MODE_COMMANDS = {20: Mode.RTL, 21: Mode.LAND, 22: Mode.TAKEOFF}
+FTP_TERMINATE, FTP_RESET, FTP_ACK, FTP_NAK, FTP_NOT_FOUND = 1, 2, 128, 129, 10
 FORCE_BIT, YAW_IGNORED, YAW_RATE_IGNORED = 512, 1024, 2048
 
 
@@ -51,6 +52,8 @@ class Inbox:
             "PARAM_REQUEST_READ": self._param_read,
             "PARAM_SET": self._param_set,
             "PING": self._ping,
+            "FILE_TRANSFER_PROTOCOL": self._file_transfer,
+            "LOG_REQUEST_LIST": self._log_list,
         }
 
     def take(self, frame: Frame, link: Link, t_ns: int) -> None:
@@ -91,6 +94,24 @@ class Inbox:
                 target_system=frame.system,
                 target_component=frame.component,
             )
+
+    def _file_transfer(self, frame: Frame, link: Link, t_ns: int) -> None:
+        """MAVLink FTP of a vehicle without files: sessions end, everything else is not found (NAK 10)."""
+        request = frame.fields["payload"]
+        sequence = (request[0] | request[1] << 8) + 1
+        payload = [0] * 251
+        payload[0:2] = (sequence & 0xFF, sequence >> 8 & 0xFF)
+        payload[2], payload[5] = request[2], request[3]
+        if request[3] in (FTP_TERMINATE, FTP_RESET):
+            payload[3] = FTP_ACK
+        else:
+            payload[3], payload[4], payload[12] = FTP_NAK, 1, FTP_NOT_FOUND
+        link.send(
+            "FILE_TRANSFER_PROTOCOL", target_system=frame.system, target_component=frame.component, payload=payload
+        )
+
+    def _log_list(self, frame: Frame, link: Link, t_ns: int) -> None:
+        link.send("LOG_ENTRY")  # num_logs 0: this vehicle keeps none
 
     def _odometry(self, frame: Frame, link: Link, t_ns: int) -> None:
         stamp = link.timesync.stamp(frame.fields["time_usec"] * 1000, self._a.boot_ns)

@@ -35,9 +35,12 @@ class ParameterService:
 
     def step(self, t_ns: int) -> None:
         """Send the second notice of changes that is due."""
-        while self._again and self._again[0][0] <= t_ns:
-            name = self._again.popleft()[1]
-            for link in self._links:
+        if not self._again or self._again[0][0] > t_ns:
+            return
+        names = sorted(name for _, name in self._again)
+        self._again.clear()
+        for link in self._links:
+            for name in names:
                 self.send_value(link, name)
 
     def send_value(self, link: Link, name: str) -> None:
