@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from simbridge.sensors import BaroSample, ImuSample
 
 HALL: dict[str, Any] = {"footprint": [[0, 0], [20, 0], [20, 12], [0, 12]], "height_m": 10}
 CONE: dict[str, Any] = {"kind": "cone", "center": [13, 6], "height_m": 3, "repose_deg": 34}
-HOVER = 0.5213  # of VEHICLE.md: 3 kg, 20.6 N a rotor, T = 0.35 u + 0.65 u^2
+HOVER = (math.sqrt(0.35**2 + 2.6 * 3.0 * 9.81 / (4 * 20.6)) - 0.35) / 1.3  # solves 4 Tmax (0.35 u + 0.65 u^2) = m g
 
 
 class Motors:
