@@ -99,19 +99,16 @@ def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by 
         tall = float(np.clip(width * span[1] / span[0], 2.5, 9.0))
         flat = float(np.clip(width * span[2] / span[0], 1.0, 3.0))
         figure, (plan, side) = plt.subplots(2, 1, figsize=(width, tall + flat + 1.4), height_ratios=[tall, flat])
-        drawn = points[np.argsort(points[:, 2], kind="stable")]
-        dots = plan.scatter(
-            drawn[:, 0], drawn[:, 1], c=drawn[:, 2], s=0.35, lw=0, cmap=HEIGHT_COLOURS, vmin=low[2], vmax=high[2],
-            rasterized=True,
-        )  # fmt: skip
+        picture, extent = _from_above(point_map.points_map, low, high)
+        shown: Any = {"cmap": HEIGHT_COLOURS, "vmin": low[2], "vmax": high[2]}
+        dots = plan.imshow(picture, extent=extent, origin="lower", interpolation="nearest", **shown)
         if len(point_map.path_map):
             plan.plot(*point_map.path_map[:, :2].T, color=VERMILION, lw=1.1, label="flown path")
             plan.legend(loc="upper right", frameon=True, framealpha=0.9, fontsize=9)
         _plan(plan, [np.vstack([low[:2], high[:2]])], "map")
         plan.set_title(f"{title} ({len(point_map.points_map):,} points)", loc="left")
         side.scatter(
-            drawn[:, 0], drawn[:, 2], c=drawn[:, 2], s=0.2, lw=0, alpha=0.5, cmap=HEIGHT_COLOURS, vmin=low[2],
-            vmax=high[2], rasterized=True,
+            points[:, 0], points[:, 2], c=points[:, 2], s=0.2, lw=0, alpha=0.5, rasterized=True, **shown
         )  # fmt: skip
         side.set_xlim(plan.get_xlim())
         side.set_ylim(low[2] - 0.5, high[2] + 0.7)
@@ -120,6 +117,21 @@ def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by 
         side.set_ylabel("z in map, m")
         figure.colorbar(dots, ax=[plan, side], label="height z in map, m", shrink=0.8, pad=0.02)
         return _save(figure, path)
+
+
+def _from_above(points: Array, low: Array, high: Array) -> tuple[Array, tuple[float, float, float, float]]:
+    """Mean height by pixel, NaN where nothing was returned, and (left, right, bottom, top) of the picture."""
+    pixel = max(float((high - low)[:2].max()) / 500, 0.02)
+    shape = tuple(int(n) + 1 for n in np.ceil((high - low)[1::-1] / pixel + 6))
+    column, row = (np.floor((points[:, i] - low[i]) / pixel).astype(np.int64) + 3 for i in (0, 1))
+    inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+    key = row[inside] * shape[1] + column[inside]
+    n = np.bincount(key, minlength=shape[0] * shape[1])
+    total = np.bincount(key, points[inside, 2], minlength=n.size)
+    with np.errstate(invalid="ignore"):
+        picture = np.where(n > 0, total / np.maximum(n, 1), np.nan).reshape(shape)
+    left, bottom = low[0] - 3 * pixel, low[1] - 3 * pixel
+    return picture, (left, left + shape[1] * pixel, bottom, bottom + shape[0] * pixel)
 
 
 def draw_surface(path: Path, report: VolumeReport, *, title: str | None = None) -> Path:
@@ -166,11 +178,11 @@ def _relief(axes: Any, x: Array, y: Array, height: Array, top: float) -> None:
 def _contours(
     figure: Any, axes: Any, report: VolumeReport, x: Array, y: Array, height: Array, state: NDArray[np.int8], top: float
 ) -> None:
-    interval = next(s for s in (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if top / s <= 10 or s == 10.0)
+    interval = next(s for s in (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if top / s <= 16 or s == 10.0)
     levels = np.arange(0.0, top + interval, interval)
     filled = axes.contourf(x, y, np.clip(height, 0.0, None), levels=levels, cmap=HEIGHT_COLOURS, extend="max")
-    lines = axes.contour(x, y, height, levels=levels[1:], colors="white", linewidths=0.6)
-    axes.clabel(lines, fmt="%g", fontsize=7)
+    lines = axes.contour(x, y, height, levels=levels[1:], colors="white", linewidths=0.5)
+    axes.clabel(lines, lines.levels[1::2], fmt="%g", fontsize=7)
     handles: list[Any] = []
     for value, colour, hatch, name in (
         (2, ORANGE, "////", f"interpolated, {100 * report.interpolated_ratio:.1f} % of the floor"),
@@ -207,7 +219,8 @@ def _plan(axes: Any, shapes: Sequence[Array], frame: str) -> None:
 def _save(figure: Any, path: Path) -> Path:
     part = path.with_name(f".{path.name}.part")
     try:
-        figure.savefig(part, dpi=130, format=path.suffix.lstrip(".") or "png", metadata={"Software": None})
+        kind = path.suffix.lstrip(".") or "png"
+        figure.savefig(part, dpi=130, format=kind, metadata={"Software": None}, bbox_inches="tight", pad_inches=0.12)
     finally:
         plt.close(figure)
     os.replace(part, path)

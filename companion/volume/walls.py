@@ -258,13 +258,41 @@ def _fit_edges(loop: Array, points: Array, spread: float) -> tuple[Array, list[_
     corners = loop[simplify_closed(loop, max(0.12, 0.7 * spread))]
     if signed_area(corners) < 0:
         corners = corners[::-1]
-    lines: list[_EdgeFit | None] = []
-    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        lines.append(_fit_edge(a, b, points, spread))
+    ends = np.roll(corners, -1, axis=0)
+    lines = [_fit_edge(a, b, points, spread) for a, b in zip(corners, ends, strict=True)]
+    corners, lines = _without_chamfers(corners, ends, lines)
     vertices: list[Array] = []
     for i, corner in enumerate(corners):
         vertices += _join(lines[i - 1], lines[i], corner)
     return np.array(vertices), [line for line in lines if line is not None]
+
+
+def _without_chamfers(corners: Array, ends: Array, lines: list[_EdgeFit | None]) -> tuple[Array, list[_EdgeFit | None]]:
+    """Leave out the short cuts that smoothing draws across corners: where the walls on both sides meet just beyond."""
+    count = len(lines)
+    length = np.hypot(*(ends - corners).T)
+    is_cut = length < 1.0
+    if count < 4 or is_cut.all():
+        return corners, lines
+    start = int(np.flatnonzero(~is_cut)[0])
+    kept: list[tuple[Array, _EdgeFit | None]] = []
+    run: list[int] = []
+    for k in [(start + n) % count for n in range(1, count + 1)]:
+        if is_cut[k]:
+            run.append(k)
+            continue
+        corner = corners[k]
+        if run:
+            middle = 0.5 * (corners[run[0]] + ends[run[-1]])
+            before, after = lines[run[0] - 1], lines[k]
+            is_corner = before is not None and after is not None and len(_join(before, after, middle)) == 1
+            if is_corner and float(length[run].sum()) < 1.6:
+                corner = middle
+            else:
+                kept += [(corners[r], lines[r]) for r in run]
+        kept.append((corner, lines[k]))
+        run = []
+    return np.array([c for c, _ in kept]), [line for _, line in kept]
 
 
 def _fit_edge(a: Array, b: Array, points: Array, spread: float) -> _EdgeFit | None:
