@@ -93,7 +93,7 @@ class Channel(Generic[T]):
         self._current.append(item)
 
     def _again(self) -> list[T]:
-        source = self._last or self._current
+        source = self._last if self._group is not None and self._last else self._current
         if not source:
             return []
         self._repeats += 1
