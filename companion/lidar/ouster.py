@@ -122,7 +122,7 @@ class OusterDecoder:
         self._format = core.PacketFormat.from_info(info)
         self._pixel = _PIXELS[profile]
         self._is_standard = info.format.header_type == core.HeaderType.STANDARD and profile != "LEGACY"
-        self._has_checksum = profile != "LEGACY"
+        self._has_identity = profile != "LEGACY"  # and a checksum
         self._columns_per_packet = int(info.format.columns_per_packet)
         self._expected_packets = int(info.format.lidar_packets_per_frame())
         self._period_ns = round(1e9 / (int(info.format.fps) * info.w))
@@ -158,7 +158,7 @@ class OusterDecoder:
         stamp, measurement = _COLUMN_START.unpack_from(packet, self._format.packet_header_size)
         if kind != PACKET_TYPE_LIDAR or measurement >= self.info.w:
             return self._drop("header")
-        if self._has_checksum and not self._is_sound(array):
+        if self._has_identity and not self._is_sound(array):
             return self._drop("checksum")
         if not self._is_ours(init_id, serial, source, t_ns):
             return self._drop("foreign")
@@ -183,7 +183,7 @@ class OusterDecoder:
         return stored is None or stored in NO_CHECKSUM or stored == self._format.calculate_crc(array)
 
     def _is_ours(self, init_id: int, serial: int, source: tuple[str, int] | None, t_ns: int) -> bool:
-        if self._serial and serial != self._serial:
+        if self._serial and serial != self._serial and self._has_identity:
             return False
         host = None if source is None else source[0]
         is_known = init_id == self._init_id and (host is None or self._host is None or host == self._host)
@@ -195,7 +195,7 @@ class OusterDecoder:
                 self._is_restarted = True
                 self.clock = SensorClock()
             self._init_id = init_id
-        self._serial = serial
+        self._serial = serial or self._serial
         self._host = host or self._host
         return True
 
