@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from simbridge.autopilot import kernels
@@ -50,6 +51,17 @@ class Aid:
         self.ratio = math.nan
 
 
+@dataclass(slots=True)
+class _Moment:
+    """What holds for a sample as a whole. `starts`: a source may start; `jumped`: reset_counter moved."""
+
+    now_ns: int
+    horizon_ns: int
+    starts: bool
+    jumped: bool
+    quality_ok: bool
+
+
 class VisionAiding:
     """Buffers vision samples and fuses each when the horizon reaches it."""
 
@@ -83,6 +95,8 @@ class VisionAiding:
     def stable(self, now_ns: int) -> bool:
         """The preflight check's view of the horizontal position."""
         if not self.xy_valid or now_ns - self._stopped_ns < UNSTABLE_AFTER_STOP_NS:
+            return False
+        if self.position.ratio > 1.0:
             return False
         return now_ns - self._started_ns >= STABLE_AFTER_NS
 
@@ -143,12 +157,11 @@ class VisionAiding:
             and now_ns - self._pushed_ns < MAX_INTERVAL_NS
         )
         jumped = previous is not None and s.reset_counter != previous.reset_counter
-        had_aid = self.aided
-        self._yaw(s, bool(control & YAW) and s.yaw_rad is not None, starts, jumped, quality_ok, horizon_ns)
-        self._velocity(s, bool(control & VEL), starts, jumped, quality_ok, horizon_ns)
-        position_ok = bool(control & HPOS) and (self.yaw_aligned or not s.is_ned)
-        self._position(s, position_ok, starts, jumped, quality_ok, horizon_ns, had_aid)
-        self._height(s, bool(control & VPOS), starts, jumped, quality_ok, horizon_ns)
+        at = _Moment(now_ns, horizon_ns, starts, jumped, quality_ok)
+        self._yaw(s, at, bool(control & YAW) and s.yaw_rad is not None)
+        self._velocity(s, at, bool(control & VEL))
+        self._position(s, at, bool(control & HPOS) and (self.yaw_aligned or not s.is_ned))
+        self._height(s, at, bool(control & VPOS))
 
     def _variance(self, measured: float, lower_name: str) -> float:
         lower = self._params.real(lower_name) ** 2
@@ -156,20 +169,18 @@ class VisionAiding:
             return lower
         return max(measured, lower)
 
-    def _failing(self, aid: Aid, quality_ok: bool, horizon_ns: int) -> bool:
+    def _failing(self, aid: Aid, at: _Moment) -> bool:
         """All samples failed for a second: True if it may be reset to vision; else it is stopped."""
-        if horizon_ns - aid.fused_ns <= NO_AID_NS:
+        if at.horizon_ns - aid.fused_ns <= NO_AID_NS:
             return False
-        if aid.resets_left > 0 and quality_ok:
+        if aid.resets_left > 0 and at.quality_ok:
             if not self._ekf.at_rest:
                 aid.resets_left -= 1
             return True
         aid.stop()
         return False
 
-    def _yaw(
-        self, s: VisionSample, wanted: bool, starts: bool, jumped: bool, quality_ok: bool, horizon_ns: int
-    ) -> None:
+    def _yaw(self, s: VisionSample, at: _Moment, wanted: bool) -> None:
         aid, ekf = self.heading, self._ekf
         if not wanted or s.yaw_rad is None:
             aid.stop()
@@ -177,32 +188,30 @@ class VisionAiding:
         variance = self._variance(s.yaw_var, "EKF2_EVA_NOISE")
         innovation = math.remainder(s.yaw_rad - kernels.yaw_of(ekf.x), 2 * math.pi)
         if not aid.active:
-            if starts:
+            if at.starts:
                 self._reset_yaw(innovation, variance)
                 self.yaw_aligned = s.is_ned
-                aid.start(horizon_ns)
+                aid.start(at.horizon_ns)
             return
-        if jumped and quality_ok:
+        if at.jumped and at.quality_ok:
             self._reset_yaw(innovation, variance)
-            aid.fused_ns = horizon_ns
+            aid.fused_ns = at.horizon_ns
             return
         gate = self._params.real("EKF2_HDG_GATE")
         aid.ratio = innovation**2 / (gate**2 * (kernels.yaw_variance(ekf.x, ekf.P) + variance))
-        if quality_ok and aid.ratio <= 1.0:
+        if at.quality_ok and aid.ratio <= 1.0:
             kernels.fuse_yaw(ekf.x, ekf.P, innovation, variance)
-            aid.fused_ns = horizon_ns
-        elif self._failing(aid, quality_ok, horizon_ns):
+            aid.fused_ns = at.horizon_ns
+        elif self._failing(aid, at):
             self._reset_yaw(innovation, variance)
-            aid.fused_ns = horizon_ns
+            aid.fused_ns = at.horizon_ns
 
     def _reset_yaw(self, angle: float, variance: float) -> None:
         self._ekf.turn(angle)
         kernels.reset_block(self._ekf.P, 2, 1, variance)
         self.reset_count += 1
 
-    def _velocity(
-        self, s: VisionSample, wanted: bool, starts: bool, jumped: bool, quality_ok: bool, horizon_ns: int
-    ) -> None:
+    def _velocity(self, s: VisionSample, at: _Moment, wanted: bool) -> None:
         aid, ekf = self.velocity, self._ekf
         if not wanted or s.velocity_mps is None or not (self.yaw_aligned or self.heading.active or s.velocity_in_body):
             aid.stop()
@@ -212,28 +221,21 @@ class VisionAiding:
             v = kernels.to_ned(ekf.x, v[0], v[1], v[2])
         variances = [self._variance(value, "EKF2_EVV_NOISE") for value in s.velocity_var]
         if not aid.active:
-            if starts:
+            if at.starts:
                 if not self.aided:
                     self._reset(3, v, variances)
-                aid.start(horizon_ns)
+                aid.start(at.horizon_ns)
             return
-        ok = self._gate_and_fuse(aid, 3, v, variances, self._params.real("EKF2_EVV_GATE"), quality_ok and not jumped)
+        ok = self._gate_and_fuse(
+            aid, 3, v, variances, self._params.real("EKF2_EVV_GATE"), at.quality_ok and not at.jumped
+        )
         if ok:
-            aid.fused_ns = horizon_ns
-        elif (jumped and quality_ok) or self._failing(aid, quality_ok, horizon_ns):
+            aid.fused_ns = at.horizon_ns
+        elif (at.jumped and at.quality_ok) or self._failing(aid, at):
             self._reset(3, v, variances)
-            aid.fused_ns = horizon_ns
+            aid.fused_ns = at.horizon_ns
 
-    def _position(
-        self,
-        s: VisionSample,
-        wanted: bool,
-        starts: bool,
-        jumped: bool,
-        quality_ok: bool,
-        horizon_ns: int,
-        had_aid: bool,
-    ) -> None:
+    def _position(self, s: VisionSample, at: _Moment, wanted: bool) -> None:
         aid = self.position
         if not wanted or s.position_m is None:
             aid.stop()
@@ -241,20 +243,21 @@ class VisionAiding:
         p = (s.position_m[0] - self._offset[0], s.position_m[1] - self._offset[1])
         variances = [self._variance(value, "EKF2_EVP_NOISE") for value in s.position_var[:2]]
         if not aid.active:
-            if starts:
+            if at.starts:
                 self._reset(6, p, variances)
-                aid.start(horizon_ns)
+                aid.start(at.horizon_ns)
             return
-        ok = self._gate_and_fuse(aid, 6, p, variances, self._params.real("EKF2_EVP_GATE"), quality_ok and not jumped)
+        ok = self._gate_and_fuse(
+            aid, 6, p, variances, self._params.real("EKF2_EVP_GATE"), at.quality_ok and not at.jumped
+        )
         if ok:
-            aid.fused_ns = horizon_ns
-        elif (jumped and quality_ok) or self._failing(aid, quality_ok, horizon_ns):
+            aid.fused_ns = at.horizon_ns
+        elif (at.jumped and at.quality_ok) or self._failing(aid, at):
             self._reset(6, p, variances)
-            aid.fused_ns = horizon_ns
+            aid.fused_ns = at.horizon_ns
+            self._started_ns = at.now_ns  # preflight has to see it stable anew
 
-    def _height(
-        self, s: VisionSample, wanted: bool, starts: bool, jumped: bool, quality_ok: bool, horizon_ns: int
-    ) -> None:
+    def _height(self, s: VisionSample, at: _Moment, wanted: bool) -> None:
         aid, ekf = self.height, self._ekf
         if not wanted or s.position_m is None:
             aid.stop()
@@ -265,17 +268,19 @@ class VisionAiding:
             z += ekf.origin.alt_m  # vision's height is taken for absolute altitude
         variances = [self._variance(s.position_var[2], "EKF2_EVP_NOISE")]
         if not aid.active:
-            if starts:
+            if at.starts:
                 if is_reference:
                     self._reset(8, (z,), variances)
-                aid.start(horizon_ns)
+                aid.start(at.horizon_ns)
             return
-        ok = self._gate_and_fuse(aid, 8, (z,), variances, self._params.real("EKF2_EVP_GATE"), quality_ok and not jumped)
+        ok = self._gate_and_fuse(
+            aid, 8, (z,), variances, self._params.real("EKF2_EVP_GATE"), at.quality_ok and not at.jumped
+        )
         if ok:
-            aid.fused_ns = horizon_ns
-        elif (jumped and quality_ok) or horizon_ns - aid.fused_ns > HEIGHT_TIMEOUT_NS:
+            aid.fused_ns = at.horizon_ns
+        elif (at.jumped and at.quality_ok) or at.horizon_ns - aid.fused_ns > HEIGHT_TIMEOUT_NS:
             self._reset(8, (z,), variances)
-            aid.fused_ns = horizon_ns
+            aid.fused_ns = at.horizon_ns
 
     def _gate_and_fuse(
         self, aid: Aid, first: int, measured: tuple[float, ...], variances: list[float], gate: float, allowed: bool

@@ -122,6 +122,10 @@ class Autopilot:
         if t_ns < self._silent_until_ns:
             return self.controller.motors
         self.now_ns, self.boot_ns = t_ns, t_ns - (self._zero_ns or 0)
+        if self.imu is not None and not math.isfinite(
+            sum(imu.accel_frd_mps2.tolist()) + sum(imu.gyro_frd_radps.tolist())
+        ):
+            imu = self.imu  # a broken sample is not taken
         self.imu = imu
         if baro is not None:
             self.baro = baro

@@ -133,7 +133,7 @@ class Inbox:
             self._a.tell(CRITICAL, f"{_SETPOINT} coordinate frame {kind} unsupported\t")
             return
         sp = [
-            NAN if mask & (1 << i) else f[n]
+            NAN if mask & (1 << i) or not math.isfinite(f[n]) else f[n]
             for i, n in enumerate(("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz"))
         ]
         if kind == BODY_NED:
@@ -147,8 +147,8 @@ class Inbox:
         if mask & FORCE_BIT and has_acceleration:
             self._a.tell(CRITICAL, f"{_SETPOINT} force not supported\t")
             return
-        sp.append(NAN if mask & YAW_IGNORED else f["yaw"])
-        sp.append(NAN if mask & YAW_RATE_IGNORED else f["yaw_rate"])
+        sp.append(NAN if mask & YAW_IGNORED or not math.isfinite(f["yaw"]) else f["yaw"])
+        sp.append(NAN if mask & YAW_RATE_IGNORED or not math.isfinite(f["yaw_rate"]) else f["yaw_rate"])
         self._a.tasks.offboard[:] = sp
         position = any(not math.isnan(v) for v in sp[0:3])
         velocity = any(not math.isnan(v) for v in sp[3:6])
@@ -165,6 +165,8 @@ class Inbox:
 
     def _origin(self, frame: Frame, link: Link, t_ns: int) -> None:
         f = frame.fields
+        if abs(f["latitude"]) > 90 * 10**7 or abs(f["longitude"]) > 180 * 10**7:
+            return
         self._a.ekf.set_origin(f["latitude"] * 1e-7, f["longitude"] * 1e-7, f["altitude"] * 1e-3)
         for each in self._a.links.values():
             each.send_stream(self._a, "GPS_GLOBAL_ORIGIN")
@@ -210,7 +212,7 @@ class Inbox:
     def _result(self, command: int, p: list[float], link: Link, t_ns: int) -> int:
         c = self._a.commander
         if command == 176:  # DO_SET_MODE
-            if not int(p[0]) & 1:
+            if not _whole(p[0]) & 1:
                 return TEMPORARILY_REJECTED
             return c.request_mode_number(_whole(p[1]), _whole(p[2]))
         if command == 400:  # COMPONENT_ARM_DISARM

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+import struct
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,7 @@ class Link:
         self._texts: deque[tuple[int, int, str]] = deque(maxlen=TEXT_QUEUE)
         self._text_id = 0
         self._next_text_ns = 0
+        self.unsent = 0
         for stream, interval in self._default.items():
             self._schedule(stream, interval, start_ns + (interval if interval >= 10**9 else 0))
 
@@ -55,10 +57,14 @@ class Link:
 
     def send_stream(self, a: Autopilot, name: str) -> bool:
         """Queue one stream message now. False if there is nothing to say yet."""
-        values = PACKERS[name](a)
-        if values is None:
+        try:
+            values = PACKERS[name](a)
+            if values is None:
+                return False
+            self.out.append(self.encoder.pack(BY_NAME[name], values))
+        except (struct.error, OverflowError, ValueError):  # an estimate driven off the wire's number range
+            self.unsent += 1
             return False
-        self.out.append(self.encoder.pack(BY_NAME[name], values))
         return True
 
     def step(self, a: Autopilot, t_ns: int) -> None:
