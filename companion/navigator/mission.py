@@ -36,7 +36,7 @@ S = NavigatorState
 
 READY_FOR_NS = 1_000_000_000  # ready and seeing for so long before arming
 VISION_BACK_NS = 1_000_000_000  # good again for so long before going on
-HOLD_AT_MOST_S = 20.0  # on poor vision; then land here
+HOLD_AT_MOST_S = 20.0  # on an uncertain position; then land here
 DEGENERATE_TURN_BACK_S = 20.0
 ABORT_STILL_S = 0.5  # zero velocity before land mode is asked for
 LAND_AGAIN_NS = 2_000_000_000  # the mode shows in the heartbeat, once a second
@@ -326,8 +326,9 @@ class Navigator:
         now = self._now
         if not now.vision.is_good:
             self._good_ns = None
-            if now.since_s(self._state_ns) > HOLD_AT_MOST_S:
-                self._land_here("vision_lost", f"held for 20 s: {now.vision.why}")
+            long_lost = now.vision.lost_s + self._config.guard.max_scan_age_s >= self._config.guard.land_after_s
+            if long_lost or now.since_s(self._state_ns) > HOLD_AT_MOST_S:
+                self._land_here("vision_lost", now.vision.why)
         elif self._good_ns is None:
             self._good_ns = now.t_ns
         elif now.t_ns - self._good_ns >= VISION_BACK_NS and not self._operator_holds:

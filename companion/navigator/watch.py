@@ -15,6 +15,7 @@ from companion.messages import OdometryEstimate, WallRanges
 RATE_SCANS = (10, 100)  # a second, and FAULTS row 3's hundred scans
 RATE_SHARE = 0.9
 SLOW_RATIO = 0.5
+UNCERTAIN = "the position is uncertain"
 JUMP_M = 1.0  # a restart of odometry that moves the pose by more makes the flown path worthless
 MIN_ENERGY_S = 30.0  # flown before the drain of the battery is believed
 
@@ -22,13 +23,15 @@ MIN_ENERGY_S = 30.0  # flown before the drain of the battery is believed
 @dataclass(frozen=True, slots=True)
 class Vision:
     """good: fly on it. speed_ratio: how much of the mission's speed is wise. lasting_degenerate_s: for how long
-    geometry has not held one direction. has_jumped: the pose was reset far away."""
+    geometry has not held one direction. has_jumped: the pose was reset far away. lost_s: for how long nothing usable
+    came (0 while it is only uncertain)."""
 
     is_good: bool
     why: str
     speed_ratio: float
     lasting_degenerate_s: float
     has_jumped: bool
+    lost_s: float = 0.0
 
 
 class VisionWatch:
@@ -37,6 +40,7 @@ class VisionWatch:
         self._period_ns = 1e9 / lidar.rate_hz
         self._scans: deque[int] = deque(maxlen=RATE_SCANS[-1] + 1)
         self._degenerate_since: int | None = None
+        self._usable_ns: int | None = None
         self._last: OdometryEstimate | None = None
 
     def step(self, t_ns: int, estimate: OdometryEstimate | None, walls: WallRanges | None) -> Vision:
@@ -51,8 +55,11 @@ class VisionWatch:
         elif self._degenerate_since is None:
             self._degenerate_since = t_ns
         lasting = (t_ns - self._degenerate_since) / 1e9 if self._degenerate_since is not None else 0.0
+        if self._usable_ns is None or why in ("", UNCERTAIN):
+            self._usable_ns = t_ns
+        lost = (t_ns - self._usable_ns) / 1e9
         slow = degenerate or self.is_lidar_slow
-        return Vision(not why, why, SLOW_RATIO if slow else 1.0, lasting, jumped)
+        return Vision(not why, why, SLOW_RATIO if slow else 1.0, lasting, jumped, lost)
 
     @property
     def is_lidar_slow(self) -> bool:
@@ -80,7 +87,7 @@ class VisionWatch:
             return "registration failed"
         variances = estimate.pose_covariance[[0, 1], [0, 1]]
         if not np.all((variances >= 0) & (variances <= self._guard.max_position_sigma_m**2)):
-            return "the position is uncertain"
+            return UNCERTAIN
         return ""
 
     def _jumped(self, estimate: OdometryEstimate) -> bool:

@@ -151,7 +151,9 @@ def test_equal_scans_on_the_ground_are_no_fault():
     assert verdict.setpoint.kind is SetpointKind.VELOCITY
 
 
-@pytest.mark.parametrize(("age_ms", "kind", "moves"), [(250, "velocity", True), (350, "velocity", False), (550, "silent", False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("age_ms", "kind", "moves"), [(250, "velocity", True), (350, "velocity", False), (550, "silent", False)]
+)
 def test_an_old_wish_is_never_flown_on(age_ms, kind, moves):
     rig = GuardRig()
     old = setpoint(rig.t, 0.5, 0.0, 0.0)
@@ -161,7 +163,9 @@ def test_an_old_wish_is_never_flown_on(age_ms, kind, moves):
     assert bool(verdict.setpoint.velocity_map_mps.any()) is moves
 
 
-@pytest.mark.parametrize(("age_s", "kind", "moves"), [(1.4, "velocity", True), (2.1, "velocity", False), (3.1, "silent", False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("age_s", "kind", "moves"), [(1.4, "velocity", True), (2.1, "velocity", False), (3.1, "silent", False)]
+)
 def test_an_unheard_vehicle_is_held_then_left_to_itself(age_s, kind, moves):
     rig = GuardRig()
     heard = rig.t
