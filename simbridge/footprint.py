@@ -44,20 +44,17 @@ class Obstacle:
             shapely.box(-self.half_m[0], -self.half_m[1], self.half_m[0], self.half_m[1]), self._to_world
         )
 
-    def distance_m(self, point: Array) -> float:
-        """From a point in `world` to its hull, 0 inside."""
-        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        dx, dy = float(point[0]) - self.center[0], float(point[1]) - self.center[1]
-        above = max(abs(float(point[2]) - self.foot_z - self.half_m[2]) - self.half_m[2], 0.0)
-        if self.is_round:
-            return math.hypot(max(math.hypot(dx, dy) - self.half_m[0], 0.0), above)
-        along = max(abs(c * dx + s * dy) - self.half_m[0], 0.0)
-        across = max(abs(-s * dx + c * dy) - self.half_m[1], 0.0)
-        return math.sqrt(along**2 + across**2 + above**2)
-
     def _to_world(self, points: Array) -> Array:
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.asarray(points @ np.array([[c, s], [-s, c]]) + np.asarray(self.center))
+
+
+def table(standing: tuple[Obstacle, ...]) -> Array:
+    """(N, 9) for the kernel `nearest_obstacle`: x, y, half sizes, cosine and sine of the yaw, foot, 1 if round."""
+    rows = [
+        (*o.center, *o.half_m, math.cos(o.yaw_rad), math.sin(o.yaw_rad), o.foot_z, float(o.is_round)) for o in standing
+    ]
+    return np.array(rows, dtype=np.float64).reshape(-1, 9)
 
 
 def outline(footprint: Footprint) -> Any:

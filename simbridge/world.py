@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from simbridge import footprint as fp
 from simbridge.config import VehicleConfig, WorldConfig
+from simbridge.kernels import nearest_obstacle
 from simbridge.model import build_model
 from simbridge.surface import Surface, build_surface, volume_m3
 
@@ -77,16 +78,19 @@ class World:
 
         To a pile: to the nearest corner of its triangles, so at most (cell^2 / 4 d) too much at distance d.
         """
-        place = shapely.Point(float(point_world[0]), float(point_world[1]))
+        x, y, z = (float(v) for v in point_world)
+        place = shapely.Point(x, y)
         to_wall = float(self._walls.distance(place)) if shapely.contains(self.footprint, place) else 0.0
-        nearest = min(to_wall, max(self.height_m - float(point_world[2]), 0.0))
-        for obstacle in self.obstacles:
-            nearest = min(nearest, obstacle.distance_m(point_world))
+        nearest = min(to_wall, max(self.height_m - z, 0.0), float(nearest_obstacle(self._obstacle_table, x, y, z)))
         if self._pile_tree is not None:
             distance, _ = self._pile_tree.query(point_world, distance_upper_bound=nearest)
-            below = self.surface.height(place.x, place.y) >= point_world[2] and self._is_pile(place.x, place.y)
-            nearest = 0.0 if below else min(nearest, float(distance))
+            is_inside = self.surface.height(x, y) >= z and self._is_pile(x, y)
+            nearest = 0.0 if is_inside else min(nearest, float(distance))
         return nearest
+
+    @cached_property
+    def _obstacle_table(self) -> Array:
+        return fp.table(self.obstacles)
 
     @cached_property
     def _walls(self) -> Any:

@@ -63,7 +63,7 @@ def test_rolled_right_it_slides_right() -> None:
 
 @pytest.mark.parametrize(("part", "accel_ug", "gyro_mdps"), [("icm-42688-p", 65, 2.8), ("bmi088", 160, 14)])
 def test_imu_noise_is_the_data_sheets(part: str, accel_ug: float, gyro_mdps: float) -> None:
-    imu = Imu(ImuConfig(part=part, accel_bias_mps2=0, gyro_bias_dps=0), seed=3)  # type: ignore[arg-type]
+    imu = Imu(ImuConfig(part=part, accel_bias_mps2=0, gyro_bias_dps=0), seed=3)
     samples = [imu.sample(REST, 0.5) for _ in range(20_000)]
     accel = np.array([s.accel_frd_mps2 for s in samples])
     gyro = np.array([s.gyro_frd_radps for s in samples])
