@@ -133,13 +133,13 @@ def update_vertical(state: Vertical, z_m: float, variance: float) -> Vertical:
 
 
 def let_go(state: Planar) -> Planar:
-    """Standing has ended: near the origin, with any velocity that a second may have given."""
-    sigma = np.array([0.05, 0.05, 0.3, 0.3, 0.2, 0.2, 0.01, 2e-3])
+    """Standing has just ended: near the origin still, and slow."""
+    sigma = np.array([0.01, 0.01, 0.05, 0.05, 0.1, 0.1, 0.005, 2e-3])
     return Planar(state.t_ns, np.zeros(N), np.diag(sigma**2))
 
 
-def let_go_vertical(state: Vertical) -> Vertical:
-    return Vertical(state.t_ns, np.zeros(2), np.diag([0.1**2, 0.5**2]))
+def let_go_vertical(state: Vertical, z_m: float) -> Vertical:
+    return Vertical(state.t_ns, np.array([z_m, 0.0]), np.diag([0.05**2, 0.5**2]))
 
 
 def restart(state: Planar, pose: Array) -> Planar:

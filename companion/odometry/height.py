@@ -22,6 +22,7 @@ MIN_GATE_M = 0.1
 MIN_GROUND_POINTS = 20
 TILT_WALK = 0.0015  # rad per sqrt(s): how fast the attitude's error wanders
 TILT_SIGMA_RAD = 0.01  # how large it is thought to be
+SHIFT_SIGMA_M = 0.008  # of x and y beside their covariance: lines are a little off too
 TILT_FLOOR_RAD = 0.0002
 MAX_TILT_RAD = math.radians(4.0)
 MAX_REJECTED = 10
@@ -76,34 +77,38 @@ class HeightTracker:
             self._rest.append(sample.distance_m)
         self._rangefinder.append(sample)
 
-    def fit(self, lower: Array, pose: Array, vertical: kalman.Vertical, walls: WallMap, sigma_m: float) -> HeightFit:
+    def fit(
+        self, lower: Array, planar: kalman.Planar, vertical: kalman.Vertical, walls: WallMap, sigma_m: float
+    ) -> HeightFit:
+        shift = planar.p[:2, :2] + np.eye(2) * SHIFT_SIGMA_M**2
         sigma_z = math.sqrt(float(vertical.p[0, 0]))
         return self.ground.fit(
             lower,
-            pose,
+            planar.x[kalman.POSE],
             float(vertical.x[0]),
             walls,
             sigma_range_m=0.5 * sigma_m,  # means of blocks of about four returns
             gate_m=0.5 + 3.0 * sigma_z,
             seen_spread_m=self._highest_m,
             tilt_information=np.asarray(np.linalg.inv(self._tilt_p), np.float64),
+            shift_information=np.asarray(np.linalg.inv(shift), np.float64),
         )
 
     def update(
         self,
         lower: Array,
-        pose: Array,
+        planar: kalman.Planar,
         vertical: kalman.Vertical,
         history: AttitudeHistory,
         walls: WallMap,
         sigma_m: float,
     ) -> tuple[kalman.Vertical, HeightResult]:
         """Vertical state after this scan. lower: (N, 3) levelled points of the layers below the horizontal one."""
-        vertical = self._use_rangefinder(vertical, pose, history)
+        vertical = self._use_rangefinder(vertical, planar.x[kalman.POSE], history)
         dt_s = max(0.0, (vertical.t_ns - self._t_ns) * 1e-9) if self._t_ns else 0.0
         self._t_ns = vertical.t_ns
         self._tilt_p = self._tilt_p + np.eye(2) * TILT_WALK**2 * dt_s
-        fit = self.fit(lower, pose, vertical, walls, sigma_m)
+        fit = self.fit(lower, planar, vertical, walls, sigma_m)
         self._highest_m = max(self._highest_m, float(vertical.x[0]))
         sigma_z = math.inf
         if fit.ground_points >= MIN_GROUND_POINTS:

@@ -112,7 +112,7 @@ def _height_above(
     if state[iy, ix] != VALID:
         return math.nan
     p = planes[iy, ix]
-    return z - (p[A] + p[BX] * (x - p[CX]) + p[BY] * (y - p[CY]))
+    return z - float(p[A] + p[BX] * (x - p[CX]) + p[BY] * (y - p[CY]))
 
 
 @kernel
@@ -181,16 +181,57 @@ def classify(
 
 
 @kernel
+def solve_spd(a: Array, b: Array) -> Array:
+    """Solve a small symmetric positive definite system by Cholesky."""
+    n = len(b)
+    low = np.zeros((n, n))
+    y, x = np.zeros(n), np.zeros(n)
+    for i in range(n):
+        for j in range(i + 1):
+            total = a[i, j]
+            for k in range(j):
+                total -= low[i, k] * low[j, k]
+            low[i, j] = math.sqrt(max(total, 1e-12)) if i == j else total / low[j, j]
+    for i in range(n):
+        y[i] = b[i]
+        for k in range(i):
+            y[i] -= low[i, k] * y[k]
+        y[i] /= low[i, i]
+    for i in range(n - 1, -1, -1):
+        x[i] = y[i]
+        for k in range(i + 1, n):
+            x[i] -= low[k, i] * x[k]
+        x[i] /= low[i, i]
+    return x
+
+
+@kernel
+def without(h: Array, keep: int) -> Array:
+    """Information of the first `keep` unknowns when the others are left free (Schur complement)."""
+    n = h.shape[0]
+    out = h[:keep, :keep].copy()
+    for k in range(keep):
+        part = solve_spd(h[keep:, keep:].copy(), h[keep:, k].copy())
+        for j in range(keep):
+            for m in range(n - keep):
+                out[j, k] -= h[j, keep + m] * part[m]
+    return out
+
+
+@kernel
 def _solve_robustly(jac: Array, res: Array, var: Array, prior: Array, iterations: int) -> tuple[Array, Array, float]:
     """Tukey-weighted least squares of res + jac x with x about 0; returns x, the points' information and the scale."""
-    n = len(res)
-    x = np.zeros(3)
-    h = np.zeros((3, 3))
+    n, m = jac.shape
+    x = np.zeros(m)
+    h = np.zeros((m, m))
     u = np.empty(n)
     scale = 1.0
     for _ in range(iterations):
         for i in range(n):
-            u[i] = (res[i] + jac[i, 0] * x[0] + jac[i, 1] * x[1] + jac[i, 2] * x[2]) / math.sqrt(var[i])
+            total = res[i]
+            for k in range(m):
+                total += jac[i, k] * x[k]
+            u[i] = total / math.sqrt(var[i])
         scale = min(max(1.4826 * np.median(np.abs(u)), 0.7), 4.0)
         h[:] = 0.0
         g = prior @ x
@@ -200,12 +241,78 @@ def _solve_robustly(jac: Array, res: Array, var: Array, prior: Array, iterations
                 continue
             w = (1.0 - v * v) ** 2 / (var[i] * scale * scale)
             r = u[i] * math.sqrt(var[i])
-            for k in range(3):
+            for k in range(m):
                 g[k] += w * jac[i, k] * r
-                for m in range(3):
-                    h[k, m] += w * jac[i, k] * jac[i, m]
-        x = x - kernels.solve3(h + prior, g)
+                for j in range(m):
+                    h[k, j] += w * jac[i, k] * jac[i, j]
+        x = x - solve_spd(h + prior, g)
     return x, h, scale
+
+
+@kernel
+def _wall_rows(
+    wall_lines: Array,
+    points: Array,
+    pose: Array,
+    kind: NDArray[np.int64],
+    place: NDArray[np.int64],
+    sigma_range_m: float,
+) -> tuple[Array, Array, Array]:
+    """Residuals of the points on walls by roll, pitch and a shift (map x, y) of the body."""
+    flat = wall_lines.reshape(-1, kernels.LINE)
+    n = np.sum(kind == WALL)
+    jac, res, var = np.zeros((n, 4)), np.zeros(n), np.zeros(n)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    k = 0
+    for i in range(points.shape[0]):
+        if kind[i] != WALL:
+            continue
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
+        q = flat[place[i]]
+        ax, ay = c * q[kernels.NX] + s * q[kernels.NY], -s * q[kernels.NX] + c * q[kernels.NY]
+        res[k] = q[kernels.NX] * (x - q[kernels.CX]) + q[kernels.NY] * (y - q[kernels.CY])
+        jac[k, 0], jac[k, 1], jac[k, 2], jac[k, 3] = -ay * pz, ax * pz, q[kernels.NX], q[kernels.NY]
+        along = (ax * px + ay * py) / max(math.sqrt(px * px + py * py + pz * pz), 1e-6)
+        line = q[kernels.ACROSS] / q[kernels.WEIGHT]
+        var[k] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * line
+        k += 1
+    return jac, res, var
+
+
+@kernel
+def _ground_rows(
+    planes: Array,
+    points: Array,
+    pose: Array,
+    z_m: float,
+    tilt: Array,
+    kind: NDArray[np.int64],
+    place: NDArray[np.int64],
+    sigma_range_m: float,
+) -> tuple[Array, Array, Array, float]:
+    """Residuals of the points on the ground by z, roll and pitch; mean pose variance of the planes used."""
+    flat = planes.reshape(-1, PLANE)
+    n = np.sum((kind == GROUND) & (place >= 0))
+    jac, res, var = np.zeros((n, 3)), np.zeros(n), np.zeros(n)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    k, pose_variance = 0, 0.0
+    for i in range(points.shape[0]):
+        if kind[i] != GROUND or place[i] < 0:
+            continue
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
+        p = flat[place[i]]
+        dx, dy = x - p[CX], y - p[CY]
+        bx, by = c * p[BX] + s * p[BY], -s * p[BX] + c * p[BY]  # slopes in the levelled frame
+        jac[k, 0], jac[k, 1], jac[k, 2] = 1.0, py + by * pz, -px - bx * pz
+        res[k] = z_m + pz - (p[A] + p[BX] * dx + p[BY] * dy) + jac[k, 1] * tilt[0] + jac[k, 2] * tilt[1]
+        along = (pz - bx * px - by * py) / max(math.sqrt(px * px + py * py + pz * pz), 1e-6)
+        plane = p[ABOUT] / p[WEIGHT] + dx * dx * p[SXX] + 2 * dx * dy * p[SXY] + dy * dy * p[SYY]
+        var[k] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * plane
+        pose_variance += p[PZ]
+        k += 1
+    return jac, res, var, pose_variance / max(k, 1)
 
 
 @kernel
@@ -219,68 +326,41 @@ def fit_height(
     place: NDArray[np.int64],
     sigma_range_m: float,
     tilt_prior: Array,
+    shift_prior: Array,
     bend_variance: float,
     iterations: int,
 ) -> tuple[Array, Array, Array]:
     """Tilt from the points on walls, then z from those on the ground.
 
     Walls are plumb, the ground's map is only as level as it was built: so the ground does not tell tilt, and z is fitted
-    with a slope of its own of that variance beside it.
+    with a slope of its own of that variance beside it. The body's place is a little off too, which must not pass for
+    tilt: it is fitted beside it.
 
-    tilt_prior: (2, 2) information about roll, pitch. Returns: (3,) correction of z, roll, pitch; (3, 3) information: of
-    z alone, and of the tilt by the walls; (4,) ground points, wall points, scale, mean pose variance of the planes used.
+    tilt_prior, shift_prior: (2, 2) information about roll, pitch and about x, y. Returns: (3,) correction of z, roll,
+    pitch; (3, 3) information: of z alone, and of the tilt by the walls; (4,) ground points, wall points, scale, mean
+    pose variance of the planes used.
     """
-    flat_planes, flat_lines = planes.reshape(-1, PLANE), wall_lines.reshape(-1, kernels.LINE)
-    ground, walls = np.sum((kind == GROUND) & (place >= 0)), np.sum(kind == WALL)
-    jac_g, res_g, var_g = np.zeros((ground, 3)), np.zeros(ground), np.zeros(ground)
-    jac_w, res_w, var_w = np.zeros((walls, 3)), np.zeros(walls), np.zeros(walls)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    a, b, pose_variance = 0, 0, 0.0
-    for i in range(points.shape[0]):
-        if place[i] < 0:
-            continue
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
-        x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
-        far = max(math.sqrt(px * px + py * py + pz * pz), 1e-6)
-        if kind[i] == GROUND:
-            p = flat_planes[place[i]]
-            dx, dy = x - p[CX], y - p[CY]
-            bx, by = c * p[BX] + s * p[BY], -s * p[BX] + c * p[BY]  # slopes in the levelled frame
-            res_g[a] = z_m + pz - (p[A] + p[BX] * dx + p[BY] * dy)
-            jac_g[a, 0], jac_g[a, 1], jac_g[a, 2] = 1.0, py + by * pz, -px - bx * pz
-            along = (pz - bx * px - by * py) / far
-            plane = p[ABOUT] / p[WEIGHT] + dx * dx * p[SXX] + 2 * dx * dy * p[SXY] + dy * dy * p[SYY]
-            var_g[a] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * plane
-            pose_variance += p[PZ]
-            a += 1
-        else:
-            q = flat_lines[place[i]]
-            ax, ay = c * q[kernels.NX] + s * q[kernels.NY], -s * q[kernels.NX] + c * q[kernels.NY]
-            res_w[b] = q[kernels.NX] * (x - q[kernels.CX]) + q[kernels.NY] * (y - q[kernels.CY])
-            jac_w[b, 1], jac_w[b, 2] = -ay * pz, ax * pz
-            along = (ax * px + ay * py) / far
-            line = q[kernels.ACROSS] / q[kernels.WEIGHT]
-            var_w[b] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * line
-            b += 1
     out = np.zeros(4)
-    out[0], out[1] = ground, walls
-    prior = np.eye(3)
-    prior[1:, 1:] = tilt_prior
-    tilt, information, _ = _solve_robustly(jac_w, res_w, var_w, prior, iterations if walls > 0 else 0)
-    for i in range(ground):
-        res_g[i] += jac_g[i, 1] * tilt[1] + jac_g[i, 2] * tilt[2]
-    left = information + prior
-    det = left[1, 1] * left[2, 2] - left[1, 2] * left[2, 1]
-    prior = np.zeros((3, 3))
-    prior[0, 0] = 1e-3
-    prior[1, 1] = 1.0 / (left[2, 2] / det + bend_variance)
-    prior[2, 2] = 1.0 / (left[1, 1] / det + bend_variance)
-    height, h, out[2] = _solve_robustly(jac_g, res_g, var_g, prior, iterations if ground > 5 else 0)
-    if ground > 5:
-        out[3] = pose_variance / ground
-        a00, a01, a11 = h[1, 1] + prior[1, 1], h[1, 2], h[2, 2] + prior[2, 2]
-        det = a00 * a11 - a01 * a01
-        lost = (h[0, 1] * (a11 * h[0, 1] - a01 * h[0, 2]) + h[0, 2] * (a00 * h[0, 2] - a01 * h[0, 1])) / det
-        information[0, 0] = max(h[0, 0] - lost, 0.0)
-    tilt[0] = height[0]
-    return tilt, information, out
+    correction, information = np.zeros(3), np.zeros((3, 3))
+    jac, res, var = _wall_rows(wall_lines, points, pose, kind, place, sigma_range_m)
+    out[1] = len(res)
+    prior = np.zeros((4, 4))
+    prior[:2, :2] = tilt_prior
+    prior[2:, 2:] = shift_prior
+    if len(res) > 0:
+        tilt, h, _ = _solve_robustly(jac, res, var, prior, iterations)
+        correction[1:] = tilt[:2]
+        h[2:, 2:] += shift_prior
+        information[1:, 1:] = without(h, 2)
+    left = np.linalg.inv(information[1:, 1:] + tilt_prior)
+    jac, res, var, out[3] = _ground_rows(planes, points, pose, z_m, correction[1:], kind, place, sigma_range_m)
+    out[0] = len(res)
+    if len(res) > 5:
+        slope_prior = np.zeros((3, 3))
+        slope_prior[0, 0] = 1e-3
+        slope_prior[1, 1] = 1.0 / (left[0, 0] + bend_variance)
+        slope_prior[2, 2] = 1.0 / (left[1, 1] + bend_variance)
+        height, h, out[2] = _solve_robustly(jac, res, var, slope_prior, iterations)
+        correction[0] = height[0]
+        information[0, 0] = without(h + slope_prior, 1)[0, 0]
+    return correction, information, out

@@ -57,11 +57,12 @@ class HeightMap:
         gate_m: float,
         seen_spread_m: float,
         tilt_information: Array,
+        shift_information: Array,
     ) -> HeightFit:
         """Match (N, 3) levelled points of the lower layers at pose (x, y, yaw) and height z_m.
 
         gate_m: how far a point may be off the known ground. seen_spread_m: range of heights flown through so far.
-        tilt_information: (2, 2) of roll and pitch as they were used for levelling.
+        tilt_information, shift_information: (2, 2) of roll and pitch, and of x and y, as they were used.
         """
         if len(points_level) > MAX_POINTS:
             points_level = points_level[:: -(-len(points_level) // MAX_POINTS)]
@@ -99,6 +100,7 @@ class HeightMap:
             place,
             sigma_range_m,
             tilt_information,
+            shift_information,
             BEND_SIGMA_RAD**2,
             4,
         )

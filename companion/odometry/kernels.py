@@ -19,9 +19,10 @@ WINDOW = 2
 # sums of a cell: weight, x, y, xx, xy, yy, height, pose variance in x, y, yaw
 W, X, Y, XX, XY, YY, Z, VX, VY, VYAW = range(10)
 SUMS = 10
-# a line: normal (2), point on it (2), variance across, weight, variance along, pose variance x, y, yaw, height spread
-NX, NY, CX, CY, ACROSS, WEIGHT, ALONG, PX, PY, PYAW, SPREAD = range(11)
-LINE = 11
+# a line: normal (2), point on it (2), variance across, weight, variance along, pose variance x, y, yaw, lowest and highest
+# z it was seen at, spread of z over which the same cells were seen
+NX, NY, CX, CY, ACROSS, WEIGHT, ALONG, PX, PY, PYAW, LOW, HIGH, SPREAD = range(13)
+LINE = 13
 DIRTY, VALID, NO_LINE = 0, 1, 2
 
 MIN_WEIGHT = 5.0
@@ -30,7 +31,11 @@ HEIGHT_MEMORY_M = 3.0  # a wall is not quite the same higher up: sums from furth
 HEIGHT_CAP = 100.0
 ANGULAR_SIGMA_RAD = 0.0015  # of a beam's direction: time stamps, attitude, the sensor's own
 TUKEY = 4.685
+NEIGHBOURS = 4  # on each side of a point
 CORRELATED = 8.0  # points of one scan that share a line, and so its error
+# A surface seen from one height only may lean: material lies at 35 deg and its outline shrinks as the vehicle climbs.
+LEVEL_M = 0.05  # change of height that matters to none
+SHARED_LEAN = 8.0  # points that lean together
 
 
 @kernel
@@ -85,14 +90,15 @@ def fit_line(sums: Array, spread: Array, state: NDArray[np.uint8], lines: Array,
     """Fit the window about a cell anew and remember it; the state says whether it is a line."""
     ny, nx = state.shape
     total = np.zeros(SUMS)
-    seen_spread = 0.0
+    low, high = 0.0, 0.0
     for jy in range(max(0, iy - WINDOW), min(ny, iy + WINDOW + 1)):
         for jx in range(max(0, ix - WINDOW), min(nx, ix + WINDOW + 1)):
             w = sums[jy, jx, W]
             if w > 0.0:
                 for k in range(SUMS):
                     total[k] += sums[jy, jx, k]
-                seen_spread += w * (spread[jy, jx, 1] - spread[jy, jx, 0])
+                low += w * spread[jy, jx, 0]
+                high += w * spread[jy, jx, 1]
     state[iy, ix] = NO_LINE
     w = total[W]
     if w < MIN_WEIGHT:
@@ -112,7 +118,7 @@ def fit_line(sums: Array, spread: Array, state: NDArray[np.uint8], lines: Array,
     line[CX], line[CY] = mx, my
     line[ACROSS], line[WEIGHT], line[ALONG] = across, w, along
     line[PX], line[PY], line[PYAW] = total[VX] / w, total[VY] / w, total[VYAW] / w
-    line[SPREAD] = seen_spread / w
+    line[LOW], line[HIGH], line[SPREAD] = low / w, high / w, (high - low) / w
     state[iy, ix] = VALID
 
 
@@ -154,35 +160,40 @@ def associate(
 
 
 @kernel
-def linearise(
+def lean_variance(line: Array, z_m: float, cell_m: float) -> float:
+    """What a line may be off at height z for want of proof that it is a wall: nothing between the heights it was seen at.
+
+    Cells of cell_m that were seen over a spread s of heights lean at most cell_m / s.
+    """
+    above = max(z_m - float(line[HIGH]), float(line[LOW]) - z_m) - LEVEL_M
+    if above <= 0.0:
+        return 0.0
+    lean = min(1.0, (cell_m / max(float(line[SPREAD]), 1e-3)) ** 2)
+    return SHARED_LEAN * (above * lean) ** 2
+
+
+@kernel
+def residuals(
     lines: Array,
     points: Array,
     found: NDArray[np.int64],
     pose: Array,
+    z_m: float,
+    cell_m: float,
     sigma_range_m: float,
     sigma_surface_m: float,
-    scale: float,
-    residual: Array,
-    system: Array,
-    statistics: Array,
-) -> None:
-    """Normal equations of the point-to-line residuals at a pose, Tukey-weighted.
-
-    residual: (N,) out, each in its own sigma (NaN where unmatched). system: (3, 4) out, H and g.
-    statistics: (6,) out: sum of weights, weighted share of inliers, normals' outer product xx, xy, yy, pose variance.
-    """
+    rows: Array,
+) -> int:
+    """Per matched point, packed in order: index, residual in m, its sigma, derivative by yaw. rows: (N, 4) out."""
     flat = lines.reshape(-1, LINE)
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    system[:] = 0.0
-    statistics[:] = 0.0
+    n = 0
     for i in range(points.shape[0]):
-        residual[i] = np.nan
         if found[i] < 0:
             continue
         line = flat[found[i]]
         px, py = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
         dx, dy = px + pose[0] - line[CX], py + pose[1] - line[CY]
-        r = line[NX] * dx + line[NY] * dy
         far = math.sqrt(px * px + py * py)
         cos2 = min(1.0, ((line[NX] * px + line[NY] * py) / max(far, 1e-6)) ** 2)
         off = -line[NY] * dx + line[NX] * dy
@@ -190,15 +201,68 @@ def linearise(
             cos2 * sigma_range_m**2
             + (1.0 - cos2) * (ANGULAR_SIGMA_RAD * far) ** 2
             + sigma_surface_m**2
+            + lean_variance(line, z_m, cell_m)
             + CORRELATED * line[ACROSS] / line[WEIGHT] * (1.0 + off * off / line[ALONG])
         )
-        u = r / math.sqrt(variance)
-        residual[i] = u
-        v = u / (TUKEY * scale)
-        if abs(v) >= 1.0:
+        rows[n, 0] = i
+        rows[n, 1] = line[NX] * dx + line[NY] * dy
+        rows[n, 2] = math.sqrt(variance)
+        rows[n, 3] = -line[NX] * py + line[NY] * px
+        n += 1
+    return n
+
+
+@kernel
+def neighbour_means(rows: Array, n: int, means: Array) -> None:
+    """Mean residual, in sigma, over each point and its neighbours in the turn: what they err by together.
+
+    Noise averages out; a surface that is not where the map has it (the outline of a pile, seen from higher up) stays.
+    """
+    total, count = 0.0, 0
+    for i in range(-NEIGHBOURS, n):
+        ahead, behind = i + NEIGHBOURS, i - NEIGHBOURS - 1
+        if ahead < n:
+            total += rows[ahead, 1] / rows[ahead, 2]
+            count += 1
+        if behind >= 0:
+            total -= rows[behind, 1] / rows[behind, 2]
+            count -= 1
+        if i >= 0:
+            means[i] = total / count
+
+
+@kernel
+def robust_scale(values: Array, least: float, most: float) -> float:
+    return min(max(1.4826 * float(np.median(np.abs(values))), least), most)
+
+
+@kernel
+def normal_equations(
+    lines: Array,
+    found: NDArray[np.int64],
+    rows: Array,
+    n: int,
+    means: Array,
+    scale: float,
+    mean_scale: float,
+    system: Array,
+    statistics: Array,
+) -> None:
+    """Sum the system, each point Tukey-weighted by its own residual and by what its neighbours err by together.
+
+    system: (3, 4) out, H and g. statistics: (5,) out: sum of weights, inliers, weighted pose variance x, y, yaw.
+    """
+    flat = lines.reshape(-1, LINE)
+    system[:] = 0.0
+    statistics[:] = 0.0
+    for k in range(n):
+        own = rows[k, 1] / rows[k, 2] / (TUKEY * scale)
+        shared = means[k] / (TUKEY * mean_scale)
+        if abs(own) >= 1.0 or abs(shared) >= 1.0:
             continue
-        w = (1.0 - v * v) ** 2 / (variance * scale * scale)
-        jyaw = -line[NX] * py + line[NY] * px
+        line = flat[found[int(rows[k, 0])]]
+        w = ((1.0 - own * own) * (1.0 - shared * shared)) ** 2 / (rows[k, 2] * scale) ** 2
+        r, jyaw = rows[k, 1], rows[k, 3]
         system[0, 0] += w * line[NX] * line[NX]
         system[0, 1] += w * line[NX] * line[NY]
         system[0, 2] += w * line[NX] * jyaw
@@ -246,6 +310,7 @@ def register_to_lines(
     cell_m: float,
     points: Array,
     guess: Array,
+    z_m: float,
     prior_information: Array,
     sigma_range_m: float,
     sigma_surface_m: float,
@@ -259,25 +324,27 @@ def register_to_lines(
     """
     n = points.shape[0]
     found = np.empty(n, np.int64)
-    residual = np.empty(n)
+    rows = np.empty((n, 4))
+    means = np.empty(n)
     system = np.zeros((3, 4))
-    statistics = np.zeros(6)
+    statistics = np.zeros(5)
     pose = guess.copy()
     out = np.zeros(9)
-    scale = 2.0
+    scale, mean_scale = 1.0, 1.0
     for iteration in range(max_iterations):
-        matched = associate(sums, spread, state, lines, origin, cell_m, points, pose, gate_m, found)
+        associate(sums, spread, state, lines, origin, cell_m, points, pose, gate_m, found)
+        m = residuals(lines, points, found, pose, z_m, cell_m, sigma_range_m, sigma_surface_m, rows)
         out[0] = iteration + 1.0
-        out[2] = matched
-        if matched < 6:
+        out[2] = m
+        if m < 6:
             break
-        if iteration < 3:  # the spread of the residuals about zero, robustly
-            linearise(lines, points, found, pose, sigma_range_m, sigma_surface_m, scale, residual, system, statistics)
-            scale = min(max(1.4826 * np.nanmedian(np.abs(residual)), 0.7), 4.0)
-        linearise(lines, points, found, pose, sigma_range_m, sigma_surface_m, scale, residual, system, statistics)
-        a = system[:, :3] + prior_information
+        neighbour_means(rows, m, means)
+        if iteration < 3:
+            scale = robust_scale(rows[:m, 1] / rows[:m, 2], 0.7, 4.0)
+            mean_scale = robust_scale(means[:m], scale / math.sqrt(2.0 * NEIGHBOURS + 1.0), 4.0)
+        normal_equations(lines, found, rows, m, means, scale, mean_scale, system, statistics)
         g = system[:, 3] + prior_information @ (pose - guess)
-        step = solve3(a, g)
+        step = solve3(system[:, :3] + prior_information, g)
         pose = pose - step
         if abs(step[0]) < 2e-4 and abs(step[1]) < 2e-4 and abs(step[2]) < 2e-5:
             out[1] = 1.0

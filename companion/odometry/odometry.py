@@ -37,6 +37,8 @@ from companion.odometry.wall_map import Registration, WallMap
 PRIOR_SIGMA = np.array([0.06, 0.06, 0.02])  # m, m, rad: holds a registration where the walls do not
 FLOOR_SIGMA = np.array([0.004, 0.004, 0.0004])  # what a registration errs by at best: roughness, time stamps
 KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
+KEYFRAME_HEIGHT_LOW_M = 0.2  # below LOW_M, where nothing yet tells walls from the foot of a pile
+LOW_M = 1.5
 MAX_PENDING = 100  # scans kept until the next keyframe
 STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
@@ -128,13 +130,11 @@ class Odometry:
         registration, judgement = None, None
         if old is None:
             snapshot = self._first(scan, planar, vertical)
-            ground = self.height.fit(lower, np.zeros(3), vertical, self.walls, self._sigma_range_m).new_ground
+            ground = self.height.fit(lower, planar, vertical, self.walls, self._sigma_range_m).new_ground
         else:
-            planar, registration, judgement, reset = self._place(planar, layer)
+            planar, registration, judgement, reset = self._place(planar, layer, float(vertical.x[0]))
             self.height.is_standing = self._standstill.is_standing
-            vertical, fit = self.height.update(
-                lower, planar.x[kalman.POSE], vertical, history, self.walls, self._sigma_range_m
-            )
+            vertical, fit = self.height.update(lower, planar, vertical, history, self.walls, self._sigma_range_m)
             ground = fit.new_ground
             if self._standstill.is_standing:
                 planar, vertical = self._stand(
@@ -192,12 +192,14 @@ class Odometry:
             is_keyframe=True,
         )
 
-    def _place(self, planar: kalman.Planar, layer: Array) -> tuple[kalman.Planar, Registration, Judgement, bool]:
+    def _place(
+        self, planar: kalman.Planar, layer: Array, z_m: float
+    ) -> tuple[kalman.Planar, Registration, Judgement, bool]:
         """Register the layer from the predicted pose; fuse it if it can be believed; search if it failed for long."""
         guess = planar.x[kalman.POSE]
         covariance = planar.p[np.ix_(kalman.POSE, kalman.POSE)]
         prior = np.asarray(np.linalg.inv(covariance + np.diag(PRIOR_SIGMA**2)), np.float64)
-        registration = self.walls.register(layer, guess, prior, sigma_range_m=self._sigma_range_m)
+        registration = self.walls.register(layer, guess, prior, z_m=z_m, sigma_range_m=self._sigma_range_m)
         judgement = judge(registration, guess, covariance, len(layer))
         if judgement.is_accepted:
             self._rejected_in_row = 0
@@ -208,7 +210,7 @@ class Odometry:
         self._rejected_in_row += 1
         self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
         if self._rejected_in_row >= FAILED_AFTER:
-            found = relocalise(self.walls, layer, guess, covariance, self._sigma_range_m)
+            found = relocalise(self.walls, layer, guess, covariance, z_m, self._sigma_range_m)
             if found is not None:
                 self._rejected_in_row = 0
                 return kalman.restart(planar, found.pose), found, judge(found, found.pose, covariance, len(layer)), True
@@ -238,7 +240,7 @@ class Odometry:
             return kalman.start(planar.t_ns), kalman.start_vertical(vertical.t_ns)
         self._base_variance = noise / max(1, self._standing_scans)
         del self._pending[-STANDING_DELAY:]
-        return kalman.let_go(planar), kalman.let_go_vertical(vertical)
+        return kalman.let_go(planar), kalman.let_go_vertical(vertical, z_shift)
 
     def _after(
         self,
@@ -254,7 +256,9 @@ class Odometry:
         period_ns = self._cfg.odometry.keyframe_period_s * 1e9
         scan_ns = 0.5e9 / self._cfg.lidar.rate_hz
         due = scan.t_ns - self._keyframe_t_ns >= period_ns - scan_ns
-        climbed = abs(float(vertical.x[0]) - self._keyframe_z_m) > KEYFRAME_HEIGHT_M
+        z_m = float(vertical.x[0])
+        step_m = KEYFRAME_HEIGHT_M if z_m > LOW_M else KEYFRAME_HEIGHT_LOW_M
+        climbed = abs(z_m - self._keyframe_z_m) > step_m
         is_keyframe = accepted and (due or climbed)
         planar_map = registration.map_variance + self._base_variance if accepted else old.map_variance[:3]
         ratio = registration.inliers / max(1.0, registration.inliers / max(registration.matched_ratio, 0.01))

@@ -15,7 +15,7 @@ MAX_SCALE = 2.0
 
 
 def relocalise(
-    walls: WallMap, layer: Array, guess: Array, covariance: Array, sigma_range_m: float
+    walls: WallMap, layer: Array, guess: Array, covariance: Array, z_m: float, sigma_range_m: float
 ) -> Registration | None:
     """The best of the registrations from guesses about the prediction, or None when none fits well enough.
 
@@ -30,11 +30,11 @@ def relocalise(
         for dx in OFFSETS_M:
             for dy in OFFSETS_M:
                 trial = guess + np.array([wide * dx, wide * dy, dyaw])
-                found = walls.register(thin, trial, free, sigma_range_m=sigma_range_m, max_iterations=8)
+                found = walls.register(thin, trial, free, z_m=z_m, sigma_range_m=sigma_range_m, max_iterations=8)
                 if best is None or (found.inliers / found.scale) > (best.inliers / best.scale):
                     best = found
     if best is None or not np.isfinite(best.pose).all():
         return None
-    final = walls.register(layer, best.pose, free, sigma_range_m=sigma_range_m, max_iterations=20)
+    final = walls.register(layer, best.pose, free, z_m=z_m, sigma_range_m=sigma_range_m, max_iterations=20)
     good = final.inliers >= MIN_INLIER_RATIO * len(layer) and final.scale <= MAX_SCALE and final.converged
     return final if good and len(layer) > 20 else None

@@ -68,6 +68,7 @@ class WallMap:
         guess: Array,
         prior_information: Array,
         *,
+        z_m: float = 0.0,
         sigma_range_m: float,
         sigma_surface_m: float = 0.02,
         gate_m: float = 0.75,
@@ -76,6 +77,7 @@ class WallMap:
         """Find x, y, yaw at which (N, 2) points in the levelled body frame lie on the walls.
 
         prior_information: (3, 3) inverse covariance of the guess; holds the pose where the walls do not.
+        z_m: height of the body: walls that were only seen from another height count less.
         """
         pose, information, out = kernels.register_to_lines(
             self.sums,
@@ -86,6 +88,7 @@ class WallMap:
             self.cell_m,
             points,
             np.asarray(guess, np.float64),
+            z_m,
             np.asarray(prior_information, np.float64),
             sigma_range_m,
             sigma_surface_m,
