@@ -77,6 +77,11 @@ class Lockstep:
         """Companion time."""
         return self.simulation.t_ns + COMPANION_CLOCK_AHEAD_NS
 
+    @property
+    def crossed_sha256(self) -> str:
+        """Of every packet and frame that crossed so far, both ways, in order."""
+        return self._digest.hexdigest()
+
     def abort(self, source: str) -> None:
         """What SIGTERM does to the companion in flight: land."""
         self.flight.on_operator(OperatorCommand(t_ns=self.t_ns, kind=OperatorCommandKind.ABORT, source=source))
@@ -126,7 +131,7 @@ class Lockstep:
             estimates=self._estimates,
             keyframe_scans=self._keyframe_scans,
             mapped_scans=self._mapped_scans,
-            crossed_sha256=self._digest.hexdigest(),
+            crossed_sha256=self.crossed_sha256,
             odometry_max_gap_s=self.flight.odometry_max_gap_s,
         )
 
