@@ -1,0 +1,1 @@
+"""Recordings: written in flight, read back, recovered, replayed."""

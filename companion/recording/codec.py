@@ -90,7 +90,7 @@ def _value(value: Any) -> Any:
 
 
 def _array(value: np.ndarray[Any, Any]) -> Any:
-    if value.size > MAX_LISTED:
+    if value.size > MAX_LISTED or (value.size == 0 and value.ndim > 1):  # an empty list forgets its shape
         little = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
         return {
             "dtype": little.dtype.str,

@@ -45,40 +45,42 @@ def recover(path: Path, output: Path | None = None) -> Recovery:
             f"{target}: is the recording itself; the original is never written to: choose another --out"
         )
     scan = open_mcap(path)
-    temporary = target.with_name(target.name + ".part")
-    messages, first_ns, last_ns = 0, None, None
-    try:
-        with temporary.open("wb") as file:
-            writer = McapWriter(file.write)
-            copier = _Copier(scan, writer)
-            for item in scan:
-                if isinstance(item, Message):
-                    messages += 1
-                    first_ns = item.t_ns if first_ns is None else min(first_ns, item.t_ns)
-                    last_ns = item.t_ns if last_ns is None else max(last_ns, item.t_ns)
-                copier.copy(item)
-            writer.finish()
-            file.flush()
-            os.fsync(file.fileno())
-        is_written = messages > 0 and not scan.is_whole
-        if is_written:
-            temporary.replace(target)
-    except OSError as error:
-        raise FileFormatError(f"{target}: cannot be written: {error.strerror}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+    times = [item.t_ns for item in scan if isinstance(item, Message)]
+    is_needed = bool(times) and not scan.is_whole
+    if is_needed:
+        _rebuild(path, target)
     return Recovery(
         path=path,
-        output=target if is_written else None,
+        output=target if is_needed else None,
         is_whole=scan.is_whole,
-        messages=messages,
-        first_ns=first_ns,
-        last_ns=last_ns,
+        messages=len(times),
+        first_ns=min(times, default=None),
+        last_ns=max(times, default=None),
         bytes_total=len(scan.data),
         bytes_lost=sum(d.bytes_lost for d in scan.damage),
         orphans=scan.orphans,
         damage=tuple(scan.damage),
     )
+
+
+def _rebuild(path: Path, target: Path) -> None:
+    """Write all that can be read of path to target, which is complete or not there."""
+    temporary = target.with_name(target.name + ".part")
+    try:
+        with temporary.open("wb") as file:
+            writer = McapWriter(file.write)
+            scan = open_mcap(path)
+            copier = _Copier(scan, writer)
+            for item in scan:
+                copier.copy(item)
+            writer.finish()
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    except OSError as error:
+        raise FileFormatError(f"{target}: cannot be written: {error.strerror}") from None
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 class _Copier:
