@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -168,30 +169,40 @@ def config_validate(mission: MissionArgument, settings: SetOption = None, as_jso
         typer.echo(f"{mission}: valid ({loaded.name}{'' if loaded.sim else ', without a world: for fly only'})")
 
 
-def _mount() -> None:
-    """Commands that live in their own files."""
-    from stockpilot.doctor import doctor
-    from stockpilot.ground import ground_app
-    from stockpilot.info import info_command
-    from stockpilot.odometry_cli import odometry_command
-    from stockpilot.recover import recover_command
-    from stockpilot.replay import replay_command
-    from stockpilot.sweep import sweep_command
-    from stockpilot.volume_cli import volume_command
+# Commands in files of their own, imported only when they are called: name, module, what it gives, one line of help.
+ELSEWHERE = (
+    ("volume", "volume_cli", "volume_command", "Measure the material in a point cloud (PLY, LAS, LAZ)."),
+    ("sweep", "sweep", "sweep_command", "Fly a grid of missions; go on where it stopped; one table, one page."),
+    ("doctor", "doctor", "doctor", "Check a flight controller before a mission: parameters, time, sensors, fusion."),
+    ("ground", "ground", "ground_app", "An operator's commands: status, hold, land, abort, logs."),
+    ("replay", "replay", "replay_command", "Fly a recording again, to the last bit, or with other settings."),
+    ("recover", "recover", "recover_command", "Rebuild a recording that was cut or damaged; the original stays."),
+    ("info", "info", "info_command", "Say what is in a recording, and how whole it is."),
+    ("odometry", "odometry_cli", "odometry_command", "Run the odometry on other people's recordings."),
+)
 
-    app.command("volume")(volume_command)
-    app.command("sweep")(sweep_command)
-    app.command("doctor")(doctor)
-    app.add_typer(ground_app, name="ground")
-    app.command("recover")(recover_command)
-    app.command("replay")(replay_command)
-    app.command("odometry")(odometry_command)
-    app.command("info")(info_command)
+
+def _mount(wanted: str | None) -> None:
+    """Put the other commands in: the one that is called with its code, the rest by name for --help."""
+    for name, module, attribute, line in ELSEWHERE:
+        if name != wanted:
+            app.command(name, help=line)(_named)
+            continue
+        found = getattr(importlib.import_module(f"stockpilot.{module}"), attribute)
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name)
+        else:
+            app.command(name)(found)
+
+
+def _named() -> None:
+    """Stands for a command in the list of --help; never called, since a called command is mounted itself."""
+    raise AssertionError("a command was called that is only listed")
 
 
 def main() -> None:
     """Entry point: errors that a person can mend are told on stderr without a traceback, exit code 2."""
-    _mount()
+    _mount(next((word for word in sys.argv[1:] if not word.startswith("-")), None))
     try:
         app(prog_name="stockpilot")
     except StockpilotError as error:

@@ -14,16 +14,19 @@ import typer
 from rich.console import Console
 
 from companion.app import App
+from companion.config import TelemetryConfig
 from companion.errors import FileFormatError
 from companion.flight import Flight
 from companion.mapping.export import save_point_map
 from companion.messages import Event, Severity, VolumeReport
 from companion.recording.log import Recorder
+from companion.telemetry.mqtt import Telemetry
 from companion.topics import EVENT, Topic
 from stockpilot.leave import write_trajectory
 from stockpilot.mission import Mission, load_mission
 from stockpilot.recorded import listen, open_recorder
 from stockpilot.results import write_json
+from stockpilot.telemetry import DELIVERY_S, mqtt_task, mqtt_telemetry
 
 RECORDER_PERIOD_S = 1.0
 STYLES = {Severity.WARNING: "yellow", Severity.NOTICE: "cyan", Severity.INFO: "dim", Severity.DEBUG: "dim"}
@@ -48,7 +51,9 @@ def fly_command(
     app = App(flight=flight, connect=connect, lidar=lidar, on_sent=recorder.output if recorder else None)
     if recorder is not None:
         app.housekeeping = _housekeeping(recorder, flight)
-    app.telemetry = _telemetry(mission, flight, folder)
+    spool = folder / "mqtt"
+    if mission.companion.telemetry.mqtt_url is not None:
+        app.telemetry = mqtt_task(mqtt_telemetry(mission.companion.telemetry, flight, spool), flight)
     began = time.monotonic()
     try:
         asyncio.run(
@@ -61,7 +66,9 @@ def fly_command(
     console.print("measuring ...", style="dim")
     volume = flight.measure() if flight.mapper.size else None
     report.update(volume_keys(volume))
-    _write(folder, flight, report)
+    _write(folder, flight, report, volume)
+    if app.telemetry is not None:
+        asyncio.run(_deliver(mission.companion.telemetry, spool, report))
     if as_json:
         typer.echo((folder / "report.json").read_text(encoding="utf-8").rstrip())
     else:
@@ -118,7 +125,17 @@ def _outcome(flight: Flight) -> dict[str, str]:
     return {"state": navigation.outcome or navigation.state.value, "reason": navigation.reason}
 
 
-def _write(folder: Path, flight: Flight, report: dict[str, Any]) -> None:
+async def _deliver(cfg: TelemetryConfig, spool: Path, report: dict[str, Any]) -> None:
+    """The report to the broker; what it does not take in time waits on disk for the next start."""
+    telemetry = Telemetry(cfg, spool, on_command=lambda command: None)
+    telemetry.report({key: value for key, value in report.items() if key != "events"})
+    link = asyncio.create_task(telemetry.run())
+    await telemetry.flush(DELIVERY_S)
+    link.cancel()
+    await asyncio.gather(link, return_exceptions=True)
+
+
+def _write(folder: Path, flight: Flight, report: dict[str, Any], volume: VolumeReport | None) -> None:
     from stockpilot.pictures import draw_map, draw_surface, draw_trajectory
     from stockpilot.report import write_report_page
 
@@ -134,7 +151,8 @@ def _write(folder: Path, flight: Flight, report: dict[str, Any]) -> None:
             estimated_world_m=path[:, :2], paper_world_m=None, title=report["mission"],
         )  # fmt: skip
         pictures["map"] = draw_map(folder / "map.png", point_map)
-        pictures["surface"] = draw_surface(folder / "surface.png", flight.measure())
+        if volume is not None:
+            pictures["surface"] = draw_surface(folder / "surface.png", volume)
     write_report_page(folder / "report.html", report, pictures)
     write_json(folder / "report.json", report)
 
@@ -174,11 +192,3 @@ def _housekeeping(recorder: Recorder, flight: Flight) -> Callable[[], Any]:
                 flight.tell(event)
 
     return watch
-
-
-def _telemetry(mission: Mission, flight: Flight, folder: Path) -> Callable[[], Any] | None:
-    if mission.companion.telemetry.mqtt_url is None:
-        return None
-    from stockpilot.telemetry import mqtt_task
-
-    return mqtt_task(mission.companion.telemetry, flight, folder)
