@@ -102,6 +102,7 @@ def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by 
         picture, extent = _from_above(point_map.points_map, low, high)
         shown: Any = {"cmap": HEIGHT_COLOURS, "vmin": low[2], "vmax": high[2]}
         dots = plan.imshow(picture, extent=extent, origin="lower", interpolation="nearest", **shown)
+        plan.grid(visible=False)
         if len(point_map.path_map):
             plan.plot(*point_map.path_map[:, :2].T, color=VERMILION, lw=1.1, label="flown path")
             plan.legend(loc="upper right", frameon=True, framealpha=0.9, fontsize=9)
@@ -121,7 +122,7 @@ def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by 
 
 def _from_above(points: Array, low: Array, high: Array) -> tuple[Array, tuple[float, float, float, float]]:
     """Mean height by pixel, NaN where nothing was returned, and (left, right, bottom, top) of the picture."""
-    pixel = max(float((high - low)[:2].max()) / 500, 0.02)
+    pixel = max(float((high - low)[:2].max()) / 330, 0.02)
     shape = tuple(int(n) + 1 for n in np.ceil((high - low)[1::-1] / pixel + 6))
     column, row = (np.floor((points[:, i] - low[i]) / pixel).astype(np.int64) + 3 for i in (0, 1))
     inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])

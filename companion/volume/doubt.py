@@ -23,7 +23,7 @@ WALLS_DOUBLED_M = 0.06  # disagreement of keyframes on the walls; good poses kee
 FLOOR_BENT_M = 0.04  # undulation; power-floated and dozed floors keep within 0.02 m
 FLOOR_SEEN = 0.03  # of the area within the walls
 UNSEEN = 0.05
-THIN_CELLS = 6.0  # returns in the median cell
+THIN_CELLS = 4.0  # returns in the median cell
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,7 +12,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
 from companion.messages import Array
-from companion.volume.grid import Grid, Index, LocalPlanes, Mask, cells_of, local_planes
+from companion.volume.grid import Grid, Index, LocalPlanes, Mask, cells_of, disc, local_planes
 
 LAYER_GAP_M = 1.0  # emptiness over one cell that parts the surface from what hangs in the air above it
 MIN_POINTS = 3  # a cell with fewer is not seen
@@ -57,7 +57,9 @@ def robust_cells(points: Array, key: Index, grid: Grid) -> Cells:
     """
     index = np.flatnonzero(key >= 0)
     index = index[np.lexsort((points[index, 2], key[index]))]
-    index = index[_lowest_layer(key[index], points[index, 2], grid)]
+    in_cell = np.bincount(key[index], minlength=grid.nx * grid.ny)
+    index = index[_lowest_layer(key[index], points[index, 2], in_cell)]
+    index = index[~_hanging(_medians(key[index], points[index, 2], grid), grid).ravel()[key[index]]]
     k, p = key[index], points[index]
     x, y, z, n = _means(p, k, grid, np.ones(len(k), dtype=np.bool_))
     median = _medians(k, p[:, 2], grid)
@@ -73,19 +75,35 @@ def robust_cells(points: Array, key: Index, grid: Grid) -> Cells:
     spread = np.maximum(np.sqrt(square).reshape(grid.shape), 0.5 * scale)
     of_point = np.full(len(points), -1, dtype=np.int64)
     of_point[index[keep]] = k[keep]
-    total = int((key >= 0).sum())
+    # Judged where enough came back to judge by.
+    full = in_cell >= 2 * MIN_POINTS
+    total = int(in_cell[full].sum())
     return Cells(
         x=x,
         y=y,
         z=z,
         sigma_m=np.where(n > 0, spread / np.sqrt(np.maximum(n, 1.0)), np.nan),
         kept=n,
-        dropped_ratio=1.0 - float(keep.sum()) / total if total else 0.0,
+        dropped_ratio=1.0 - float(flat[full].sum()) / total if total else 0.0,
         of_point=of_point,
     )
 
 
-def _lowest_layer(key: Index, z: Array, grid: Grid) -> Mask:
+def _hanging(z: Array, grid: Grid) -> Mask:
+    """Cells that hang higher above their surroundings than any slope of loose material reaches: dust over floor that
+    was not seen. By opening: what stands up and is narrower than the window goes."""
+    reach = cells_of(1.0, grid)
+    window = disc(reach)
+    known = np.isfinite(z)
+    lowest = ndimage.grey_erosion(np.where(known, z, np.inf), footprint=window, mode="constant", cval=np.inf)
+    opened = ndimage.grey_dilation(
+        np.where(np.isfinite(lowest), lowest, -np.inf), footprint=window, mode="constant", cval=-np.inf
+    )
+    with np.errstate(invalid="ignore"):
+        return np.asarray(known & (z - opened > MAX_SLOPE * reach * grid.cell_m + 0.3))
+
+
+def _lowest_layer(key: Index, z: Array, in_cell: Index) -> Mask:
     """Of points sorted by cell and height: those of the lowest layer in each cell that is more than strays."""
     if len(key) == 0:
         return np.zeros(0, dtype=np.bool_)
@@ -94,8 +112,7 @@ def _lowest_layer(key: Index, z: Array, grid: Grid) -> Mask:
     layer = np.cumsum(new_layer) - 1
     size = np.bincount(layer)
     cell = key[new_layer]
-    in_cell = np.bincount(key, minlength=grid.nx * grid.ny)[cell]
-    solid = size >= np.maximum(MIN_POINTS, 0.05 * in_cell)
+    solid = size >= np.maximum(MIN_POINTS, 0.05 * in_cell[cell])
     chosen = np.zeros(len(size), dtype=np.bool_)
     solid_layers = np.flatnonzero(solid)
     _, first = np.unique(cell[solid_layers], return_index=True)

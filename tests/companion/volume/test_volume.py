@@ -1,0 +1,207 @@
+"""The volume of maps whose truth is known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from companion.config import VolumeConfig
+from companion.messages import PointMap, VolumeReport
+from companion.volume import estimate_volume
+from companion.volume.polygon import signed_area
+from tests.companion.volume.synthetic import (
+    Flight,
+    Hall,
+    Synthetic,
+    circle,
+    cone,
+    l_shape,
+    leaning,
+    make_map,
+    rectangle,
+    ridge,
+    rotated,
+)
+
+CFG = VolumeConfig()
+# A scan each 1.5 s instead of three keeps these tests quick; the campaign in benchmarks/ flies as the vehicle does.
+QUICK = Flight(scan_period_s=1.5)
+GOOD_POSES = dataclasses.replace(QUICK, position_sigma_m=0.015, height_sigma_m=0.008, yaw_sigma_rad=0.0008)
+
+CENTRE = rotated(np.array([[25.0, 15.0]]), 0.4)[0]
+HALLS = {
+    "free-standing": Hall(footprint=rectangle(), pile=ridge(25, 15, 6, 6.0, 0.7)),
+    "turned hall": Hall(footprint=rotated(rectangle(), 0.4), pile=cone(CENTRE[0], CENTRE[1], 6.5, 0.65)),
+    "leaning on a wall": Hall(footprint=rectangle(), pile=leaning(30.0, 25, 8, 6.0, 0.7)),
+    "L-shaped": Hall(footprint=l_shape(), pile=cone(15, 15, 5.5, 0.6)),
+    "silo": Hall(footprint=circle(15), pile=cone(0, 0, 6, 0.6)),
+    "columns": Hall(
+        footprint=rectangle(), pile=ridge(25, 15, 6, 6.0, 0.7), columns=((10, 12, 0.3), (40, 18, 0.3), (25, 8.5, 0.4))
+    ),
+    "sloping floor": Hall(footprint=rectangle(), pile=ridge(25, 15, 6, 6.0, 0.7), floor_slope=(0.02, -0.01)),
+}
+
+
+def measured(synthetic: Synthetic) -> tuple[VolumeReport, float]:
+    report = estimate_volume(synthetic.point_map, CFG)
+    return report, 100.0 * (report.volume_m3 / synthetic.true_volume_m3 - 1.0)
+
+
+@pytest.fixture(scope="module")
+def free_standing() -> Synthetic:
+    return make_map(HALLS["free-standing"], QUICK, 1)
+
+
+@pytest.mark.parametrize("name", HALLS)
+def test_volume_with_perfect_poses_is_right_to_half_a_percent(name: str) -> None:
+    report, error = measured(make_map(HALLS[name], QUICK, 1))
+    assert abs(error) < 0.5
+    assert report.interval_m3[0] < report.volume_m3 < report.interval_m3[1]
+    assert report.warnings == ()
+
+
+@pytest.mark.parametrize("name", ["free-standing", "leaning on a wall", "silo"])
+def test_interval_holds_the_truth_with_good_poses(name: str) -> None:
+    synthetic = make_map(HALLS[name], GOOD_POSES, 2)
+    report, error = measured(synthetic)
+    assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
+    assert abs(error) < 1.0
+    assert report.interval_m3[1] - report.interval_m3[0] < 0.05 * synthetic.true_volume_m3
+
+
+def test_walls_are_found_where_they_are(free_standing: Synthetic) -> None:
+    report, _ = measured(free_standing)
+    assert signed_area(report.footprint_m) == pytest.approx(1500.0, rel=0.002)
+    corners = HALLS["free-standing"].footprint
+    for corner in corners:
+        assert np.hypot(*(report.footprint_m - corner).T).min() < 0.1
+
+
+def test_ratios_sum_to_one_and_grids_agree(free_standing: Synthetic) -> None:
+    report, _ = measured(free_standing)
+    assert report.seen_ratio + report.interpolated_ratio + report.unseen_ratio == pytest.approx(1.0)
+    assert report.seen_ratio > 0.85
+    shape = (len(report.y_m), len(report.x_m))
+    assert report.surface_z_m.shape == report.floor_z_m.shape == report.cell_state.shape == shape
+    assert np.isnan(report.surface_z_m[report.cell_state == 0]).all()
+    assert np.isfinite(report.surface_z_m[report.cell_state > 0]).all()
+
+
+def test_same_map_gives_the_same_bits(free_standing: Synthetic) -> None:
+    first, second = (estimate_volume(free_standing.point_map, CFG) for _ in range(2))
+    assert first.volume_m3 == second.volume_m3
+    assert first.interval_m3 == second.interval_m3
+    assert first.surface_z_m.tobytes() == second.surface_z_m.tobytes()
+
+
+def test_frame_of_the_map_does_not_matter(free_standing: Synthetic) -> None:
+    there = free_standing.point_map
+    c, s = np.cos(1.0), np.sin(1.0)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    shift = np.array([431_000.0, 5_412_000.0, -312.0])  # a survey's coordinates
+    moved = dataclasses.replace(
+        there, points_map=there.points_map @ turn.T + shift, path_map=there.path_map @ turn.T + shift
+    )
+    volume, _ = measured(free_standing)
+    assert estimate_volume(moved, CFG).volume_m3 == pytest.approx(volume.volume_m3, rel=0.002)
+
+
+def test_cloud_without_a_path_gives_the_same_volume(free_standing: Synthetic) -> None:
+    bare = dataclasses.replace(
+        free_standing.point_map,
+        path_map=np.zeros((0, 3)),
+        keyframe_id=np.zeros(len(free_standing.point_map.points_map), dtype=np.int64),
+    )
+    report = estimate_volume(bare, CFG)
+    assert report.volume_m3 == pytest.approx(free_standing.true_volume_m3, rel=0.005)
+    assert report.warnings == ()
+
+
+def test_heap_in_the_open_needs_no_walls() -> None:
+    rng = np.random.default_rng(3)
+    xy = rng.uniform([-20, -15], [20, 15], (150_000, 2))
+    z = np.maximum(4.0 - 0.6 * np.hypot(*xy.T), 0.0) + 0.01 * xy[:, 0] + rng.normal(0, 0.03, len(xy))
+    report = estimate_volume(cloud(np.column_stack([xy, z])), CFG)
+    assert report.volume_m3 == pytest.approx(np.pi * 4.0**3 / 0.6**2 / 3, rel=0.01)
+    assert any("no closed walls" in w for w in report.warnings)
+
+
+def test_dust_does_not_hide_the_walls() -> None:
+    dusty = dataclasses.replace(GOOD_POSES, dust_ratio=0.04, lost_ratio=0.1)
+    synthetic = make_map(HALLS["free-standing"], dusty, 4)
+    report, error = measured(synthetic)
+    assert abs(error) < 1.0
+    assert signed_area(report.footprint_m) == pytest.approx(1500.0, rel=0.01)
+
+
+def test_noise_near_the_floor_is_not_rectified() -> None:
+    flat = Hall(footprint=rectangle(), pile=lambda x, y: np.zeros_like(x))
+    report, _ = measured_absolute(flat, dataclasses.replace(QUICK, noise_m=0.3))
+    assert abs(report.volume_m3) < 1.0  # of 1,500 m2 of floor: less than a millimetre
+
+
+def measured_absolute(hall: Hall, flight: Flight) -> tuple[VolumeReport, float]:
+    synthetic = make_map(hall, flight, 5)
+    return estimate_volume(synthetic.point_map, CFG), synthetic.true_volume_m3
+
+
+def test_half_a_lap_says_what_it_did_not_see() -> None:
+    half = dataclasses.replace(QUICK, arc=(0.0, 0.4), max_range_m=25.0)
+    synthetic = make_map(HALLS["free-standing"], half, 6)
+    report, _ = measured(synthetic)
+    assert report.unseen_ratio + report.interpolated_ratio > 0.05
+    whole, _ = measured(make_map(HALLS["free-standing"], QUICK, 6))
+    assert np.diff(report.interval_m3)[0] > 3 * np.diff(whole.interval_m3)[0]
+    assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
+
+
+def test_poses_that_contradict_each_other_are_told_and_widen_the_interval() -> None:
+    sure_but_wrong = dataclasses.replace(QUICK, position_sigma_m=0.25, told_position_sigma_m=0.01)
+    synthetic = make_map(HALLS["free-standing"], sure_but_wrong, 7)
+    report, _ = measured(synthetic)
+    assert any("disagree on the walls" in w for w in report.warnings)
+    assert np.diff(report.interval_m3)[0] > 0.02 * synthetic.true_volume_m3
+    assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
+
+
+def test_floor_hidden_everywhere_is_told() -> None:
+    deep = Hall(footprint=rectangle(40, 28), pile=lambda x, y: 2.0 + 0.1 * x + 0.5 * np.sin(0.4 * y))
+    synthetic = make_map(deep, QUICK, 8)
+    report, _ = measured(synthetic)
+    assert report.warnings
+    low, high = report.interval_m3
+    assert low <= synthetic.true_volume_m3 <= high or any("floor" in w for w in report.warnings)
+
+
+def test_wider_confidence_gives_a_wider_interval(free_standing: Synthetic) -> None:
+    narrow = estimate_volume(free_standing.point_map, VolumeConfig(interval_level=0.68))
+    wide = estimate_volume(free_standing.point_map, VolumeConfig(interval_level=0.99))
+    assert np.diff(wide.interval_m3)[0] > 2 * np.diff(narrow.interval_m3)[0]
+
+
+def cloud(points: np.ndarray) -> PointMap:
+    return PointMap(
+        points_map=points,
+        keyframe_id=np.zeros(len(points), dtype=np.int64),
+        range_m=np.zeros(len(points)),
+        path_map=np.zeros((0, 3)),
+    )
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((0, 3)),
+        np.full((1000, 3), np.nan),
+        np.zeros((1000, 3)),
+        np.column_stack([np.linspace(0, 10, 1000), np.zeros(1000), np.zeros(1000)]),
+        np.random.default_rng(0).normal(0, 5, (1000, 3)),
+    ],
+    ids=["empty", "not finite", "one place", "a line", "a ball"],
+)
+def test_no_map_makes_it_raise(points: np.ndarray) -> None:
+    report = estimate_volume(cloud(points), CFG)
+    assert report.warnings
+    assert not np.isfinite(report.volume_m3) or report.interval_m3[1] > report.interval_m3[0]
