@@ -18,13 +18,14 @@ from simbridge.server import UdpLink
 from simbridge.sitl import SitlError, parameters
 from simbridge.sitl.ardupilot import PHYSICS_PORT, ArduPilotSitl
 from simbridge.sitl.process import start_arducopter, start_px4
-from simbridge.sitl.px4 import Px4Sitl
+from simbridge.sitl.px4 import SIMULATOR_PORT, Px4Sitl
 
 Array = NDArray[np.float64]
 
 COMPANION_PORT = 14540  # where PX4 sends; ArduCopter is told to
 GROUND_PORT = 14550
-PX4_OFFBOARD_PORT = 14580
+PX4_ITS_PORT_ABOVE = 40  # PX4 itself binds 14580 for the link to 14540
+PX4_INSTANCES = 10
 OFFBOARD_URL, GROUND_URL = f"udpin://127.0.0.1:{COMPANION_PORT}", f"udpin://127.0.0.1:{GROUND_PORT}"
 PX4_COMMANDS_PER_STEP, PX4_STEP_NS = 1, 4_000_000
 ARDUPILOT_COMMANDS_PER_STEP, ARDUPILOT_STEP_NS = 4, 5_000_000  # 800 Hz
@@ -67,14 +68,8 @@ class RealWire:
 
 def prepare_real(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple[Simulation, RealWire, ExitStack]:
     """World, wire and what ends them, for a flight in lockstep. Raises: ConfigError, LinkError."""
-    port = 0 if autopilot == "ardupilot" and binary is not None else COMPANION_PORT  # 0: any; it will be told
     with ExitStack() as stack:
-        try:
-            link = UdpLink(remote=("127.0.0.1", PX4_OFFBOARD_PORT), local=("127.0.0.1", port))
-        except OSError as error:
-            raise LinkError(
-                f"UDP port {COMPANION_PORT}, where the autopilot sends, is taken ({error.strerror}): another companion?"
-            ) from error
+        link = _companion_link(autopilot, is_ours=binary is not None)
         stack.callback(link.close)
         simulation, closing = simulation_for(cfg, autopilot, binary, companion_port=link.port)
         stack.enter_context(closing)
@@ -87,13 +82,13 @@ def simulation_for(
 ) -> tuple[Simulation, ExitStack]:
     """The world with a real flight controller: started from `binary`, else waited for. Close the stack to end both.
 
-    companion_port: where an ArduCopter that we start sends its MAVLink; PX4 has its own.
+    companion_port: where one that we start sends its MAVLink; of PX4 it tells the instance: 14540 is 0, 14541 is 1.
     Raises: ConfigError: no such autopilot, no such binary, parameters of another. LinkError: a port is taken.
     """
     with ExitStack() as stack:
         try:
             if autopilot == "px4":
-                simulation = _with_px4(cfg, binary, stack)
+                simulation = _with_px4(cfg, binary, stack, companion_port - COMPANION_PORT)
             elif autopilot == "ardupilot":
                 simulation = _with_arducopter(cfg, binary, stack, companion_port)
             else:
@@ -104,11 +99,24 @@ def simulation_for(
     raise AssertionError("unreachable")
 
 
-def _with_px4(cfg: SimConfig, binary: Path | None, stack: ExitStack) -> Simulation:
-    sitl = Px4Sitl(seed=cfg.seed)
+def _companion_link(autopilot: str, *, is_ours: bool) -> UdpLink:
+    """Where the autopilot sends: the usual port, or for one that we start, and can tell, a free one."""
+    ports = [COMPANION_PORT]
+    if is_ours:
+        ports = [0] if autopilot == "ardupilot" else [COMPANION_PORT + i for i in range(PX4_INSTANCES)]
+    for port in ports:
+        try:
+            return UdpLink(remote=("127.0.0.1", port + PX4_ITS_PORT_ABOVE), local=("127.0.0.1", port))
+        except OSError as error:
+            reason = error.strerror
+    raise LinkError(f"UDP port {ports[-1]}, where the autopilot sends, is taken ({reason}): another companion?")
+
+
+def _with_px4(cfg: SimConfig, binary: Path | None, stack: ExitStack, instance: int) -> Simulation:
+    sitl = Px4Sitl(port=SIMULATOR_PORT + instance, seed=cfg.seed)
     stack.callback(sitl.close)
     if binary is not None:
-        sitl.process = stack.enter_context(start_px4(binary, parameters.PX4 | cfg.autopilot.params))
+        sitl.process = stack.enter_context(start_px4(binary, parameters.PX4 | cfg.autopilot.params, instance=instance))
     simulation = Simulation(cfg, RealController(sitl), step_ns=PX4_STEP_NS, commands_per_step=PX4_COMMANDS_PER_STEP)
     sitl.attach(simulation.truth)
     return simulation

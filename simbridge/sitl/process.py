@@ -71,13 +71,16 @@ class AutopilotProcess:
         self.stop()
 
 
-def start_px4(binary: Path, parameters: Mapping[str, float], folder: Path | None = None) -> AutopilotProcess:
+def start_px4(
+    binary: Path, parameters: Mapping[str, float], folder: Path | None = None, *, instance: int = 0
+) -> AutopilotProcess:
     """Start PX4 SITL as a client of our simulator port.
 
     Args:
         binary: .../bin/px4 of a SITL build; its etc/ (start-up scripts) is looked for beside it.
         parameters: set over the airframe's before its modules start.
         folder: working folder, new or empty; None: a temporary one that `stop` removes.
+        instance: 0 to 9, added to each of PX4's port numbers, but not to its system id.
     Raises: SitlError: no such binary, no etc/ with it, folder not empty.
     """
     binary = _executable(binary)
@@ -88,9 +91,9 @@ def start_px4(binary: Path, parameters: Mapping[str, float], folder: Path | None
         raise SitlError(f"{binary}: no etc/init.d-posix beside it or one folder up: give the px4 of a whole SITL build")
     work, owned = _fresh_folder(folder)
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PX4_")}
-    environment |= {"PX4_SIM_MODEL": "none_iris"}
+    environment |= {"PX4_SIM_MODEL": "none_iris", "PX4_PARAM_MAV_SYS_ID": "1"}
     environment |= {f"PX4_PARAM_{name}": f"{value:g}" for name, value in parameters.items()}
-    return _start([str(binary), "-d", "-w", str(work), str(etc)], work, owned, environment)
+    return _start([str(binary), "-d", "-i", str(instance), "-w", str(work), str(etc)], work, owned, environment)
 
 
 def start_arducopter(

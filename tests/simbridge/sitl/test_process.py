@@ -34,9 +34,12 @@ def test_px4_gets_our_parameters_its_etc_and_a_fresh_folder(tmp_path: Path, monk
     binary = px4_build(tmp_path, 'echo "$@"; pwd; env | grep ^PX4_ | sort; echo done; sleep 60')
     with start_px4(binary, {"EKF2_EV_CTRL": 15, "THR_MDL_FAC": 0.65}) as process:
         text = log_of(process, "done")
-        assert f"-d -w {process.folder} {tmp_path / 'build' / 'etc'}" in text
+        assert f"-d -i 0 -w {process.folder} {tmp_path / 'build' / 'etc'}" in text
         assert text.splitlines()[1] == str(process.folder)
-        assert "PX4_PARAM_EKF2_EV_CTRL=15\nPX4_PARAM_THR_MDL_FAC=0.65\nPX4_SIM_MODEL=none_iris" in text
+        assert (
+            "PX4_PARAM_EKF2_EV_CTRL=15\nPX4_PARAM_MAV_SYS_ID=1\nPX4_PARAM_THR_MDL_FAC=0.65\nPX4_SIM_MODEL=none_iris"
+            in text
+        )
         assert process.is_running
     assert not process.is_running
     assert not process.folder.exists()
