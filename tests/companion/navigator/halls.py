@@ -65,7 +65,7 @@ HALLS: dict[str, list[Ring]] = {
     # Columns at odd places: one so near the wall that D fits on neither side, one in a corner.
     "clutter": [
         rectangle(0, 0, 60, 40),
-        *[column(x, y) for x, y in [(15, 14), (30, 14), (45, 14), (15, 27), (30, 26), (45, 26), (52, 9)]],
+        *[column(x, y) for x, y in [(15, 14), (30, 14), (45, 13), (15, 27), (30, 27), (45, 27), (52, 9)]],
     ],
 }  # fmt: skip
 
@@ -172,7 +172,7 @@ class Rig:
         c, s = math.cos(yaw0), math.sin(yaw0)
         return c * dx + s * dy, -s * dx + c * dy, wrap_angle(self.yaw - yaw0)
 
-    def _scan(self) -> WallRanges:
+    def _scan(self) -> WallRanges | None:
         columns = 512
         bearing = 2 * math.pi * np.arange(columns) / columns
         true = self.hall.cast(self.x, self.y, bearing + self.yaw)
@@ -209,8 +209,9 @@ class Rig:
     def step(self, *commands: OperatorCommand) -> NavigatorOutput:
         self.t += 50 * MS
         if self.see:
-            if (self.t // (50 * MS)) % 2 == 0:
-                self.pending.append((self.t + 60 * MS, self._scan()))
+            scan = self._scan() if (self.t // (50 * MS)) % 2 == 0 else None
+            if scan is not None:
+                self.pending.append((self.t + 60 * MS, scan))
             while self.pending and self.pending[0][0] <= self.t:
                 self.walls = self.pending.pop(0)[1]
             self.estimate = self._estimate()

@@ -106,11 +106,10 @@ def test_a_slow_lidar_slows_the_flight_within_a_second_or_so(flown_to):
     rig = flown_to(S.FOLLOW)
     cast = rig._scan
     before = float(np.hypot(rig.v[0], rig.v[1]))
-    rig._scan = lambda: cast() if rig.t // (100 * MS) % 2 else rig.walls  # every second scan only
+    rig._scan = lambda: cast() if rig.t // (100 * MS) % 3 else None  # every third scan is lost
     trace = run(rig, 2.5)
     speeds = [float(np.hypot(*s.velocity_map_mps[:2])) for t, s in trace if s is not None and t > 1.7]
     assert max(speeds) < 0.65 * max(before, 0.43)
-    print(rig.log.events, rig.navigator._reason)
     assert rig.navigator.state is S.FOLLOW
 
 
