@@ -10,6 +10,7 @@ from companion.messages import FlightMode, LandedState
 _MAIN_AUTO = 4
 _MAIN_OFFBOARD = 6
 _SUB_TAKEOFF, _SUB_LOITER, _SUB_MISSION, _SUB_RTL, _SUB_LAND, _SUB_PRECLAND = 2, 3, 4, 5, 6, 9
+_SUB_DESCEND = 20  # PX4 main from August 2026 on; 1.18 says AUTO_LAND
 _STANDARD_LAND = 7  # MAV_STANDARD_MODE_LAND
 _AUTO_MODES = {
     _SUB_TAKEOFF: FlightMode.TAKEOFF,
@@ -18,6 +19,7 @@ _AUTO_MODES = {
     _SUB_RTL: FlightMode.RETURN,
     _SUB_LAND: FlightMode.LAND,
     _SUB_PRECLAND: FlightMode.LAND,
+    _SUB_DESCEND: FlightMode.DESCEND,
 }
 
 

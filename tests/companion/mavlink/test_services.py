@@ -216,6 +216,7 @@ def test_no_timesync_message_moves_a_stamp_into_the_future(messages: list[tuple[
         (4, 6, 2, 7, FlightMode.LAND),
         (4, 6, 4, 0, FlightMode.DESCEND),
         (4, 6, 1, None, FlightMode.LAND),
+        (4, 20, 2, None, FlightMode.DESCEND),  # as a PX4 of August 2026 said it after a loss of vision
         (3, 0, 2, None, FlightMode.MANUAL),
         (1, 0, 2, None, FlightMode.MANUAL),
         (7, 0, 2, None, FlightMode.MANUAL),
