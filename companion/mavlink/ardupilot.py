@@ -56,6 +56,7 @@ ARDUPILOT = Dialect(
         (wire.GPS_GLOBAL_ORIGIN, 0.2),
     ),
     timesync_answers=0,  # corrects for jitter itself
+    has_bytewise_parameters=False,
     needs_takeoff=True,
     estimator_message=wire.EKF_STATUS_REPORT,
     decode_mode=decode_mode,

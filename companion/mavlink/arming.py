@@ -7,6 +7,7 @@ import math
 from companion.geometry import wrap_angle, yaw_from_quat
 from companion.mavlink.dialect import Dialect
 from companion.mavlink.origin import Origin, OriginState
+from companion.mavlink.parameters import Parameters
 from companion.mavlink.timesync import Timesync
 from companion.mavlink.vehicle import LOST_AGE_NS, Vehicle
 from companion.mavlink.vision import Vision
@@ -26,6 +27,7 @@ def reasons_not_to_arm(
     timesync: Timesync,
     vision: Vision,
     attitude: AttitudeSample | None,
+    parameters: Parameters,
     t_ns: int,
 ) -> tuple[str, ...]:
     """All that stands against arming; empty when nothing does."""
@@ -33,6 +35,7 @@ def reasons_not_to_arm(
         return ("link: no heartbeat of a PX4 or ArduPilot yet: check cable, port, baud rate and the system id",)
     reasons = [
         _heartbeat(vehicle, t_ns),
+        *parameters.reasons(),
         _origin(origin),
         timesync.missing(dialect.timesync_answers),
         _attitude(vehicle, t_ns),

@@ -39,6 +39,7 @@ class Dialect:
     mode_params: param1 to 3 of DO_SET_MODE by mode. streams_hz: message id -> rate asked for; 0 switches it off.
     timesync_answers: how many of its TIMESYNC questions must be answered before it believes our time stamps.
     decode_mode: the mode in our words. is_vision_fused, is_position_valid: from the estimator's flags.
+    has_bytewise_parameters: integers lie in the bytes of PARAM_VALUE's float.
     needs_takeoff: leaves the ground only by NAV_TAKEOFF, not by a velocity setpoint.
     """
 
@@ -49,6 +50,7 @@ class Dialect:
     mode_params: Mapping[FlightMode, tuple[float, float, float]]
     streams_hz: tuple[tuple[int, float], ...]
     timesync_answers: int
+    has_bytewise_parameters: bool
     needs_takeoff: bool
     estimator_message: int
     decode_mode: Callable[[ModeReport], FlightMode]

@@ -13,6 +13,7 @@ from companion.mavlink.dialect import Dialect
 from companion.mavlink.journal import Journal
 from companion.mavlink.origin import Origin
 from companion.mavlink.outbox import Outbox
+from companion.mavlink.parameters import Parameters
 from companion.mavlink.px4 import PX4
 from companion.mavlink.texts import Texts
 from companion.mavlink.timesync import Timesync
@@ -36,6 +37,7 @@ class Hearing:
         commands: Commands,
         origin: Origin,
         journal: Journal,
+        parameters: Parameters,
         *,
         on_begin: Callable[[], None],
         dropped: Callable[[str], None],
@@ -48,6 +50,7 @@ class Hearing:
         self._outbox = outbox
         self._commands = commands
         self._journal = journal
+        self._parameters = parameters
         self._on_begin = on_begin
         self._dropped = dropped
         self._texts = Texts()
@@ -67,6 +70,8 @@ class Hearing:
             wire.STATUSTEXT: self._on_text,
             wire.EVENT: self._on_event,
             wire.CURRENT_MODE: self._on_current_mode,
+            wire.PARAM_VALUE: self._on_parameter,
+            wire.PARAM_ERROR: self._on_parameter_error,
         }
 
     def hear(self, frame: Frame, t_ns: int) -> AttitudeSample | RangefinderSample | None:
@@ -104,6 +109,7 @@ class Hearing:
         self._commands.clear()
         self.timesync.restart()
         self.origin.restart(t_ns)
+        self._parameters.restart(dialect.name, is_bytewise=dialect.has_bytewise_parameters)
         self.attitude = None
         self._on_begin()
         for msg_id, rate_hz in dialect.streams_hz:
@@ -252,6 +258,12 @@ class Hearing:
         answer = self.timesync.on_message(tc1, ts1, t_ns)
         if answer is not None:
             self._outbox.put(wire.TIMESYNC, wire.pack(wire.TIMESYNC, *answer), t_ns)
+
+    def _on_parameter(self, payload: bytes, t_ns: int) -> None:
+        self._parameters.on_value(payload)
+
+    def _on_parameter_error(self, payload: bytes, t_ns: int) -> None:
+        self._parameters.on_error(payload)
 
     def _on_text(self, payload: bytes, t_ns: int) -> None:
         self._journal.add(self._texts.on_text(payload, t_ns))

@@ -75,6 +75,7 @@ PX4 = Dialect(
         *((unused, 0.0) for unused in (30, 36, 33, 74, 83, 85, 105, 141, 241, 290, 291, wire.ODOMETRY)),
     ),
     timesync_answers=500,  # lib/timesync: CONVERGENCE_WINDOW
+    has_bytewise_parameters=True,
     needs_takeoff=False,
     estimator_message=wire.ESTIMATOR_STATUS,
     decode_mode=decode_mode,

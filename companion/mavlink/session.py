@@ -16,6 +16,7 @@ from companion.mavlink.heartbeats import Heartbeats, SignsOfLife
 from companion.mavlink.journal import Journal
 from companion.mavlink.origin import Origin, OriginAction, OriginState
 from companion.mavlink.outbox import Outbox
+from companion.mavlink.parameters import Parameters
 from companion.mavlink.px4 import PX4
 from companion.mavlink.setpoints import pack_obstacles, pack_setpoint
 from companion.mavlink.signing import Signer
@@ -70,12 +71,14 @@ class MavlinkSession:
         self._signs = SignsOfLife()
         self._commands = Commands(self._send_command, cfg.system_id)
         self._takeoff = Takeoff(self._commands)
+        self._parameters = Parameters(self._ask_parameter, cfg.system_id)
         self._vision = Vision()
         self._hearing = Hearing(
             self._outbox,
             self._commands,
             Origin(round(cfg.origin_latitude_deg * 1e7), round(cfg.origin_longitude_deg * 1e7)),
             self._journal,
+            self._parameters,
             on_begin=self._on_begin,
             dropped=self._sources.drop,
         )
@@ -134,6 +137,7 @@ class MavlinkSession:
             self._outbox.put(wire.TIMESYNC, wire.pack(wire.TIMESYNC, *timesync.ask(t_ns)), t_ns)
         self._poll_origin(t_ns)
         self._commands.poll(t_ns)
+        self._parameters.poll(t_ns)
 
     def _poll_origin(self, t_ns: int) -> None:
         vehicle, dialect, origin = self._hearing.vehicle, self._hearing.dialect, self._hearing.origin
@@ -159,8 +163,8 @@ class MavlinkSession:
             if self._hearing.origin.state is not OriginState.CONFIRMED:
                 deadlines.append(self._hearing.origin.t_next_ns)
             retry = self._commands.next_deadline_ns()
-            if retry is not None:
-                deadlines.append(retry)
+            again = self._parameters.next_deadline_ns(self._journal.t_ns)
+            deadlines.extend(t for t in (retry, again) if t is not None)
         return min(deadlines)
 
     def take_events(self) -> list[Event]:
@@ -318,8 +322,12 @@ class MavlinkSession:
             timesync=self._hearing.timesync,
             vision=self._vision,
             attitude=self._hearing.attitude,
+            parameters=self._parameters,
             t_ns=t_ns,
         )
+
+    def _ask_parameter(self, payload: bytes) -> None:
+        self._outbox.put(wire.PARAM_REQUEST_READ, payload, self._journal.t_ns)
 
     def _send_command(self, payload: bytes) -> None:
         self._outbox.put(wire.COMMAND_LONG, payload, self._journal.t_ns)

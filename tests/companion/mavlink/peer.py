@@ -3,12 +3,14 @@ hears was packed by code that is not ours."""
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as m
 
 from companion.config import MavlinkConfig
+from companion.mavlink.manifest import ARDUPILOT_MANIFEST, PX4_MANIFEST
 from companion.mavlink.session import MavlinkSession, Received
 from companion.messages import Event, OdometryEstimate, RequestKind, Setpoint, SetpointKind, VehicleRequest
 
@@ -23,6 +25,8 @@ PX4_FUSED = 511
 PX4_NOT_FUSED = 229
 AP_FUSED = 0x33F
 AP_NOT_FUSED = 0x0A7
+PX4_GOOD = {expected.name: expected.mend for expected in PX4_MANIFEST.parameters}
+ARDUPILOT_GOOD = {expected.name: expected.mend for expected in ARDUPILOT_MANIFEST.parameters}
 
 
 def packer(system: int = 1, component: int = 1) -> Any:
@@ -101,6 +105,8 @@ class Peer:
         self.answers_timesync = True
         self.q = (1.0, 0.0, 0.0, 0.0)
         self.silent = False
+        self.parameters: dict[str, float] = dict(PX4_GOOD if autopilot == 12 else ARDUPILOT_GOOD)
+        self.answers_parameters = True
         self.sent: list[Any] = []  # what the session sent, as pymavlink read it
         self.events: list[Event] = []
         self.received: list[Received] = []
@@ -166,12 +172,33 @@ class Peer:
                 self._say_origin()
             if self.ack is not None:
                 self.say(m.MAVLink_command_ack_message(message.command, self.ack, 0, 0, 1, 191))
+        elif name == "PARAM_REQUEST_READ" and self.answers_parameters:
+            self.say_parameter(message.param_id)
         elif name == "SET_GPS_GLOBAL_ORIGIN":
             if self._origins_ignored < self.answers_origin_after:
                 self._origins_ignored += 1
             else:
                 self.has_origin = True
                 self._say_origin()
+
+    def say_parameter(self, name: str) -> None:
+        """PX4: integers bytewise, an error for what it does not have. ArduPilot: cast, no answer at all."""
+        value = self.parameters.get(name)
+        if value is None:
+            if self.autopilot == 12:
+                self.say(m.MAVLink_param_error_message(255, 190, name.encode(), -1, 1))
+            return
+        is_real = value != int(value) or name in (
+            "COM_OF_LOSS_T",
+            "RTL_RETURN_ALT",
+            "GF_MAX_HOR_DIST",
+            "GF_MAX_VER_DIST",
+        )
+        if self.autopilot == 12 and not is_real:
+            (wired,) = struct.unpack("<f", struct.pack("<i", int(value)))
+        else:
+            wired = value
+        self.say(m.MAVLink_param_value_message(name.encode(), wired, 9 if is_real else 6, 900, 65535))
 
     def _say_origin(self) -> None:
         self.say(m.MAVLink_gps_global_origin_message(474000000, 85000000, 0, 0))
