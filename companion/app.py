@@ -19,7 +19,7 @@ import numpy as np
 
 from companion.flight import Flight
 from companion.lidar.udp import LidarSocket, open_lidar
-from companion.mavlink.link import Link, open_link
+from companion.mavlink.link import MavlinkLink, open_link
 from companion.messages import LidarScan, OperatorCommand, OperatorCommandKind
 from companion.odometry import ScanResult
 
@@ -48,7 +48,7 @@ class App:
     _scan_ready: asyncio.Event = field(default_factory=asyncio.Event)
     _to_map: deque[ScanResult] = field(default_factory=lambda: deque(maxlen=MAP_QUEUE))
     _map_ready: asyncio.Event = field(default_factory=asyncio.Event)
-    _link: Link | None = None
+    _link: MavlinkLink | None = None
 
     async def run(self, ready: Callable[[], None] | None = None) -> None:
         """Raises: LinkError: a link cannot be opened (before anything is sent)."""
@@ -113,10 +113,10 @@ class App:
             if self.flight.is_finished and finished_ns is None:
                 finished_ns = time.monotonic_ns()
 
-    async def _receive_mavlink(self, link: Link) -> None:
+    async def _receive_mavlink(self, link: MavlinkLink) -> None:
         while True:
-            for packet in (await link.receive(), *link.receive_waiting()):
-                self.flight.on_mavlink(packet.data, packet.t_ns, packet.source)
+            for data, t_ns, source in await link.take():
+                self.flight.on_mavlink(data, t_ns, source)
             self._send()
 
     async def _receive_lidar(self, lidar: LidarSocket) -> None:

@@ -51,7 +51,7 @@ class UdpLink:
             self.unsent += 1
 
     def receive(self) -> list[bytes]:
-        out = []
+        out: list[bytes] = []
         while True:
             try:
                 data, source = self._socket.recvfrom(RECEIVE_BYTES)

@@ -211,13 +211,13 @@ def _plain(message: str) -> str:
 def _real_location(location: Location, raw: object) -> Location:
     """The location without pydantic's union tags, which stand in no file."""
     out: list[str | int] = []
-    here: object = raw
+    here: Any = raw
     for n, part in enumerate(location):
         last = n == len(location) - 1
         if (isinstance(here, dict) and part in here) or (
             isinstance(here, list) and isinstance(part, int) and part < len(here)
         ):
-            here = here[part]
+            here = here[part]  # type: ignore[index]
             out.append(part)
         elif last and not (isinstance(part, str) and ("[" in part or not isinstance(here, dict))):
             out.append(part)
@@ -322,7 +322,7 @@ def _apply_setting(raw: dict[str, Any], setting: str) -> None:
             here = here[part]
         else:
             raise ConfigError(f"--set {setting}: {_dotted(location[: n + 1])} is not in the mission")
-    last = location[-1]
+    last: Any = location[-1]
     if isinstance(here, dict) or (isinstance(here, list) and isinstance(last, int) and last < len(here)):
         here[last] = value
     else:

@@ -44,7 +44,7 @@ def draw_trajectory(
     path: Path,
     *,
     outlines: Sequence[Array],
-    truth_world_m: Array,
+    truth_world_m: Array | None,
     estimated_world_m: Array,
     paper_world_m: Array | None = None,
     pile_outlines: Sequence[Array] = (),
@@ -52,7 +52,8 @@ def draw_trajectory(
 ) -> Path:
     """Plan of the hall with the flown path (truth), ours upon it and the paper's beside it; below, our error times 1.
 
-    All in `world`, metres: outlines: rings (K, 2) of walls and obstacles; paths (N, 2).
+    All in `world`, metres: outlines: rings (K, 2) of walls and obstacles; paths (N, 2). Where there is no truth (a real
+    flight) all are in `map`, and the walls are those fitted.
     """
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(9, 6.2))
@@ -63,8 +64,9 @@ def draw_trajectory(
         handles: list[Any] = [Line2D([], [], color=BLACK, lw=1.6, label="walls, obstacles")]
         if pile_outlines:
             handles.append(Patch(facecolor="#EFE3CC", edgecolor="#C9B58C", label="pile"))
-        axes.plot(*truth_world_m.T, color=SKY, lw=5.0, alpha=0.75, solid_capstyle="round", zorder=3)
-        handles.append(Line2D([], [], color=SKY, lw=5, alpha=0.75, label="flown (truth)"))
+        if truth_world_m is not None:
+            axes.plot(*truth_world_m.T, color=SKY, lw=5.0, alpha=0.75, solid_capstyle="round", zorder=3)
+            handles.append(Line2D([], [], color=SKY, lw=5, alpha=0.75, label="flown (truth)"))
         if paper_world_m is not None and len(paper_world_m):
             axes.plot(*paper_world_m.T, color=VERMILION, lw=1.2, ls="--", marker="o", ms=2.5, zorder=4)
             handles.append(
@@ -77,7 +79,8 @@ def draw_trajectory(
             axes.plot(*estimated_world_m[-1], marker="X", ms=8, mfc=BLUE, mec="white", mew=0.8, ls="", zorder=7)
             handles.append(Line2D([], [], marker="o", mfc="white", mec=BLUE, ls="", ms=8, label="start"))
             handles.append(Line2D([], [], marker="X", mfc=BLUE, mec="white", ls="", ms=8, label="landing"))
-        _plan(axes, [*outlines, truth_world_m], "world")
+        flown = estimated_world_m if truth_world_m is None else truth_world_m
+        _plan(axes, [*outlines, flown], "map" if truth_world_m is None else "world")
         axes.set_title(title, loc="left")
         figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9)
         return _save(figure, path)
