@@ -33,8 +33,9 @@ def read_velodyne(path: Path) -> Iterator[VelodyneScan]:
     try:
         for stamp, points in velodyne_decoder.read_pcap(str(path)):
             end_ns = round(float(stamp.device) * 1e9)
-            xyz = np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float64)
-            times = end_ns + np.round(points["time"].astype(np.float64) * 1e9).astype(np.int64)
+            columns = np.asarray(points, dtype=np.float64)  # x, y, z, intensity, ring, time
+            xyz = np.ascontiguousarray(columns[:, :3])
+            times = end_ns + np.round(columns[:, 5] * 1e9).astype(np.int64)
             yield VelodyneScan(end_ns, xyz, times)
     except (RuntimeError, ValueError) as error:
         raise FileFormatError(f"{path}: not a Velodyne capture that can be decoded: {error}") from None

@@ -34,11 +34,12 @@ def fragments(data: bytes, size: int, identity: int = 1) -> list[bytes]:
     ]
 
 
-def classic(frames: list[bytes], order: str = "<", ns: bool = False, link: int = 1) -> bytes:
+def classic(frames: list[bytes], order: str = "<", ns: bool = False, link: int = 1, step_us: int = 10**6) -> bytes:
     magic = 0xA1B23C4D if ns else 0xA1B2C3D4
     out = struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, link)
     for n, frame in enumerate(frames):
-        out += struct.pack(order + "IIII", 100 + n, 5, len(frame), len(frame)) + frame
+        seconds, fraction = divmod(n * step_us, 10**6)
+        out += struct.pack(order + "IIII", 100 + seconds, 5 + fraction, len(frame), len(frame)) + frame
     return out
 
 
