@@ -57,6 +57,7 @@ class Rig:
         self.origin: tuple[int, int, int] | None = (473977432, 85455942, 0)
         self.vision_edit: Callable[[dict[str, Any]], None] = lambda fields: None
         self.position_noise_m, self.velocity_noise_mps, self.attitude_noise_rad = 0.01, 0.02, 0.003
+        self.on_output: Callable[[str, bytes], None] = lambda link, frame: None
         self._setpoint: Callable[[], tuple[int, int, list[float]]] | None = None
         self.odometry_period_ns, self.odometry_delay_ns = 32_000_000, 0
         self._late: list[tuple[int, bytes]] = []
@@ -101,7 +102,10 @@ class Rig:
         v.step(self.autopilot.step(t, imu, baro, None))
         self.log.append((t / S, np.concatenate([self.position_ned(), self.velocity_ned(), [self.yaw()]])))
         self.t_ns = t + STEP_NS
-        for _, frame in self.autopilot.take_output():
+        for link, frame in self.autopilot.take_output():
+            self.on_output(link, frame)
+            if link != "offboard":
+                continue
             self.sent += [(t / S, m) for m in self._parser.parse_buffer(frame) or []]
 
     # truth
