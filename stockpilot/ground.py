@@ -116,8 +116,9 @@ async def _logs(link: VehicleLink, out: Path | None, newest: int) -> Result:
     listed = [{"id": e.id, "date": e.date, "bytes": e.size_bytes} for e in entries]
     if out is None:
         return {"ok": True, "logs": listed}
-    out.mkdir(parents=True, exist_ok=True)
-    console, saved = Console(stderr=True), []
+    await asyncio.to_thread(out.mkdir, parents=True, exist_ok=True)
+    console = Console(stderr=True)
+    saved: list[str] = []
     for entry in entries[-newest:]:
         path = out / f"log{entry.id:03d}_{entry.date.replace(':', '').replace(' ', '_') or 'nodate'}.ulg"
         try:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from companion.errors import LinkError
+from companion.mavlink.wire import COMP_COMPANION, COMP_ESTIMATOR
 
 GROUND_SYSTEM = 255  # a ground station's own, MAV_COMP_ID_MISSIONPLANNER
 GROUND_COMPONENT = 190
@@ -34,12 +35,16 @@ class VehicleLink:
     arrived_s: dict[str, float] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
     texts: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=_TEXTS))
+    version: str | None = None
+    has_companion: bool = False  # heard a companion's heartbeat for the same vehicle
     _chunks: dict[int, str] = field(default_factory=dict)
+    _trips_s: dict[int, float] = field(default_factory=dict)
 
     async def listen(self) -> None:
         """Take in every message, until cancelled."""
         async for message in self.direct.subscribe_message(""):
             if message.component_id != AUTOPILOT:
+                self.has_companion = self.has_companion or message.component_id in (COMP_COMPANION, COMP_ESTIMATOR)
                 continue
             name = message.message_name
             try:
@@ -51,6 +56,8 @@ class VehicleLink:
             self.counts[name] += 1
             if name == "HEARTBEAT":
                 self.autopilot = _AUTOPILOTS.get(int(fields.get("autopilot", 0)), "other")
+            elif name == "TIMESYNC" and fields.get("tc1"):
+                self._trips_s[int(fields["ts1"])] = (time.monotonic_ns() - int(fields["ts1"])) * 1e-9
             elif name == "STATUSTEXT":
                 self._take_text(fields)
 
@@ -80,6 +87,22 @@ class VehicleLink:
             await self.direct.send_message(message)
         except MavlinkDirectError as error:
             raise LinkError(f"{self.url}: {name} could not be sent: {error}") from None
+
+    async def command(self, number: int, *params: float) -> None:
+        """COMMAND_LONG, without waiting for its answer."""
+        fields: Fields = {f"param{i + 1}": 0.0 for i in range(7)}
+        fields |= {f"param{i + 1}": value for i, value in enumerate(params)}
+        ids = {"target_system": await self.system.get_system_id(), "target_component": AUTOPILOT}
+        await self.send("COMMAND_LONG", {**fields, **ids, "command": number, "confirmation": 0})
+
+    async def wait_for_timesync(self, asked_ns: int, timeout_s: float) -> float | None:
+        """How long the answer to our question took, s."""
+        end = time.monotonic() + timeout_s
+        while asked_ns not in self._trips_s:
+            if time.monotonic() >= end:
+                return None
+            await asyncio.sleep(0.002)
+        return self._trips_s.pop(asked_ns)
 
     async def wait_for(self, name: str, timeout_s: float) -> Fields | None:
         """The next message of that name; None when none comes."""
