@@ -28,13 +28,12 @@ from companion.navigator.legs import Climb, Descent, Ending, Homeward, Round, Se
 from companion.navigator.motion import STILL, Motion
 from companion.navigator.route import Path
 from companion.navigator.situation import NOTHING_YET, Lookout
-from companion.navigator.takeover import LANDING_MODES, Loss, control_lost, not_ready
+from companion.navigator.takeover import LANDING_MODES, Loss, Readiness, control_lost
 from companion.navigator.wall_follower import lane_m
 from companion.navigator.watch import Battery, BatteryWatch
 
 S = NavigatorState
 
-READY_FOR_NS = 1_000_000_000  # ready and seeing for so long before arming
 VISION_BACK_NS = 1_000_000_000  # good again for so long before going on
 HOLD_AT_MOST_S = 20.0  # on an uncertain position; then land here
 DEGENERATE_TURN_BACK_S = 20.0
@@ -73,7 +72,7 @@ class Navigator:
         self._outcome, self._reason = "completed", ""
         self._operator_holds = False
         self._was_found_armed = False
-        self._not_ready: tuple[str, ...] = ()
+        self._readiness = Readiness()
         self._islands: tuple[Island, ...] = ()
         self._laps_closed = 0
         # Built when they begin.
@@ -84,12 +83,10 @@ class Navigator:
         # Since when.
         self._state_ns = 0
         self._armed_ns: int | None = None
-        self._ready_ns: int | None = None
         self._good_ns: int | None = None
         self._land_asked_ns: int | None = None
         self._ground_ns: int | None = None
         self._disarmed_ns: int | None = None
-        self._home_s: tuple[float, int] = (0.0, -(10**18))
 
     def step(self, t_ns: int, inputs: NavigatorInput) -> NavigatorOutput:
         """Take in the newest and decide. Never raises on bad measurements."""
@@ -97,7 +94,9 @@ class Navigator:
         self._now = self._lookout.look(t_ns, inputs)
         self._obey(inputs.commands)
         if self.state is S.WAIT_READY:
-            self._note_readiness(inputs)
+            news = self._readiness.note(self._now, inputs)
+            if news:
+                self._tell(Severity.NOTICE, "not_ready", news)
         elif self.state in IN_FLIGHT:
             self._look_out()
         handler = self._handlers.get(self.state)
@@ -180,11 +179,9 @@ class Navigator:
         now = self._now
         if self._start is None or now.vehicle is None:
             return
-        if now.t_ns - self._home_s[1] > 1_000_000_000:
-            height = max(0.0, now.z_m - self._start.z)
-            way_s = self._path.home_m() / self._cfg.forward_speed_mps + height / self._cfg.climb_speed_mps + 20.0
-            self._home_s = (way_s, now.t_ns)
-        battery = self._battery.step(now.t_ns, now.vehicle.battery_ratio, self._home_s[0])
+        down_s = max(0.0, now.z_m - self._start.z) / self._cfg.climb_speed_mps + 20.0
+        home_s = self._path.home_m() / self._cfg.forward_speed_mps + down_s
+        battery = self._battery.step(now.t_ns, now.vehicle.battery_ratio, home_s)
         if battery is Battery.CRITICAL and self.state is not S.LAND:
             self._land_here("battery_critical", "the battery is nearly empty")
         elif battery is Battery.LOW and self.state in OUTWARD:
@@ -192,23 +189,12 @@ class Navigator:
 
     # ---- on the ground ----------------------------------------------------------------------------------------------
 
-    def _note_readiness(self, inputs: NavigatorInput) -> None:
-        why = not_ready(self._now, inputs)
-        news = {reason.partition(":")[0] for reason in why} != {reason.partition(":")[0] for reason in self._not_ready}
-        self._not_ready = why
-        if news and why:  # what is missing has changed, not just how much of it
-            self._tell(Severity.NOTICE, "not_ready", "not ready: " + "; ".join(why))
-        if why:
-            self._ready_ns = None
-        elif self._ready_ns is None:
-            self._ready_ns = self._now.t_ns
-
     def _wait_ready(self) -> Motion | None:
         vehicle = self._now.vehicle
         if vehicle is not None and vehicle.is_connected and vehicle.is_armed:
             self._was_found_armed = True
             self._interrupt("found_armed", "the vehicle was armed already: the companion stays passive")
-        elif self._ready_ns is not None and self._now.t_ns - self._ready_ns >= READY_FOR_NS:
+        elif self._readiness.is_ready(self._now):
             self._handshake = Handshake(self._now.t_ns, may_arm=True)
             self._go(S.ARMING, "all is ready")
             return STILL
@@ -221,7 +207,7 @@ class Navigator:
             if now.vehicle is not None and now.vehicle.is_armed:
                 self._interrupt("not_ready", "lost sight or the link while taking control")
             else:
-                self._ready_ns = None
+                self._readiness = Readiness()
                 self._go(S.WAIT_READY, "no longer ready")
             return None
         request, progress = self._handshake.step(now.t_ns, now.vehicle)
@@ -362,10 +348,8 @@ class Navigator:
             self._go(S.HOLDING, why)
 
     def _interrupt(self, outcome: str, why: str) -> None:
-        if self.state in OUTWARD or self.state is S.RETURN:
+        if self.state in OUTWARD | {S.RETURN, S.LAND}:
             self._before = self.state
-        elif self.state is S.LAND:
-            self._before = S.LAND
         self._outcome, self._reason, self._operator_holds, self._disarmed_ns = outcome, why, False, None
         self._tell(Severity.CRITICAL, outcome, why)
         self._go(S.INTERRUPTED, why)
@@ -415,12 +399,12 @@ class Navigator:
             )  # fmt: skip
         interrupted = self.state is S.INTERRUPTED and self._now.since_s(self._disarmed_ns) > OVER_AFTER_S
         over = interrupted or self.state in FINISHED
-        following = self._round if self.state is S.FOLLOW else None
-        turned = following.turned_rad if following is not None else 0.0
-        progress = (self._laps_closed + max(0.0, min(0.99, turned / (2 * math.pi)))) / self._cfg.laps
+        turning = self._round if self.state is S.FOLLOW else None
+        share = max(0.0, min(0.99, turning.turned_rad / (2 * math.pi))) if turning is not None else 0.0
         return NavigatorOutput(
             setpoint=setpoint, requests=tuple(self._requests), events=tuple(self._events), state=self.state,
             lap_closed=self._laps_closed >= self._cfg.laps, finished=over,
-            is_straight=following is not None and following.is_straight, progress_ratio=min(1.0, progress),
+            is_straight=turning is not None and turning.is_straight,
+            progress_ratio=min(1.0, (self._laps_closed + share) / self._cfg.laps),
             path_length_m=self._path.length_m, outcome=self._outcome if over else "", reason=self._reason,
         )  # fmt: skip

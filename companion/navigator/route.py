@@ -23,6 +23,7 @@ class Path:
     def __init__(self) -> None:
         self.places: list[tuple[float, float]] = []
         self.length_m = 0.0
+        self._home_m, self._home_at = 0.0, 0
 
     def add(self, pose: Pose2) -> None:
         if self.places:
@@ -35,8 +36,10 @@ class Path:
 
     def home_m(self) -> float:
         """Length of the way home along what was flown, loops left out: an estimate from every tenth place."""
-        kept = simplified(self.places[::10] + self.places[-1:], 5.5)
-        return sum(math.dist(a, b) for a, b in pairwise(kept))
+        if len(self.places) - self._home_at >= 5:  # it grows slowly: worked out again every few metres
+            kept = simplified(self.places[::10] + self.places[-1:], 5.5)
+            self._home_m, self._home_at = sum(math.dist(a, b) for a, b in pairwise(kept)), len(self.places)
+        return self._home_m
 
 
 def simplified(places: list[tuple[float, float]], near_m: float) -> list[tuple[float, float]]:

@@ -8,6 +8,7 @@ from companion.messages import FlightMode, LandedState
 from companion.navigator.interface import NavigatorInput, NavigatorState
 from companion.navigator.situation import Situation
 
+READY_FOR_NS = 1_000_000_000
 LINK_LOST_NS = 3_000_000_000
 LANDING_MODES = frozenset({FlightMode.LAND, FlightMode.DESCEND})
 
@@ -34,6 +35,27 @@ def not_ready(now: Situation, inputs: NavigatorInput) -> tuple[str, ...]:
     if not now.vision.is_good:
         why.append(now.vision.why)
     return tuple(why)
+
+
+class Readiness:
+    """Ready means ready and seeing for READY_FOR_NS without a break."""
+
+    def __init__(self) -> None:
+        self._why: tuple[str, ...] = ()
+        self._since_ns: int | None = None
+
+    def note(self, now: Situation, inputs: NavigatorInput) -> str:
+        """What forbids arming, for people, when that has changed: not just how much is missing; else empty."""
+        before, self._why = self._why, not_ready(now, inputs)
+        if self._why:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = now.t_ns
+        kinds = [{reason.partition(":")[0] for reason in why} for why in (before, self._why)]
+        return "not ready: " + "; ".join(self._why) if self._why and kinds[0] != kinds[1] else ""
+
+    def is_ready(self, now: Situation) -> bool:
+        return self._since_ns is not None and now.t_ns - self._since_ns >= READY_FOR_NS
 
 
 def control_lost(now: Situation, state: NavigatorState, *, land_asked: bool) -> Loss | None:
