@@ -8,7 +8,6 @@ time moves; from then on each step answers one request.
 from __future__ import annotations
 
 import contextlib
-import select
 import socket
 import time
 
@@ -26,7 +25,8 @@ Array = NDArray[np.float64]
 
 PHYSICS_PORT = 9002
 STEADY_FRAMES = 20  # the same rate so many times: it falls no more
-SILENCE_S = 2.5  # a held-up ArduCopter asks again each 1.1 s
+SILENCE_S = 2.5  # ArduCopter asks again after 1.1 s without an answer
+LOST_ANSWER_S = 0.5
 RECEIVE_BYTES = 2048
 
 
@@ -52,6 +52,7 @@ class ArduPilotSitl:
         self._request: ServoPacket | None = None
         self._peer: tuple[str, int] | None = None
         self._was_connected = False
+        self._replied_s = 0.0  # wall time
         self._lost_s: float | None = None  # wall time when ArduCopter fell silent
         self.restarts = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -62,7 +63,6 @@ class ArduPilotSitl:
             raise SitlError(
                 f"cannot listen for ArduCopter on UDP {host}:{port}: {e.strerror}; is another simulation running?"
             ) from e
-        self._socket.setblocking(False)
         self.port = self._socket.getsockname()[1]
 
     def attach(self, truth: PoseSource) -> None:
@@ -138,15 +138,17 @@ class ArduPilotSitl:
         )
 
     def _next_request(self) -> ServoPacket | None:
-        """The next new request; one that comes again is answered again. None: silence, it has ended or restarts."""
+        """The next new request. None: silence, it has ended or restarts.
+
+        One that was answered before is answered again where the answer must have been lost; copies that ArduCopter sent
+        while we were held up come right after the answer and are passed over, or each would add a frame of delay.
+        """
         deadline = time.monotonic() + SILENCE_S
-        while (left_s := deadline - time.monotonic()) > 0:
-            request = self._receive(left_s)
-            if request is None:
-                break
+        while (request := self._receive(deadline - time.monotonic())) is not None:
             if not request.is_repeat:
                 return self._take(request)
-            self._reply(self._physics.repeated_reply())
+            if time.monotonic() - self._replied_s > LOST_ANSWER_S:
+                self._reply(self._physics.repeated_reply())
         self._lost_s = time.monotonic()
         return None
 
@@ -162,20 +164,23 @@ class ArduPilotSitl:
             raise SitlError(f"ArduCopter has not asked for physics for {self._connect_timeout_s:g} s: it has ended")
 
     def _receive(self, timeout_s: float) -> ServoPacket | None:
-        """The newest request waiting: after a pause several copies of one lie there. None after timeout_s."""
-        newest: ServoPacket | None = None
-        if not select.select([self._socket], [], [], max(0.0, timeout_s))[0]:
-            return None
-        while True:
+        """The next request; None after timeout_s without one."""
+        deadline = time.monotonic() + timeout_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            self._socket.settimeout(left_s)
             try:
                 data, self._peer = self._socket.recvfrom(RECEIVE_BYTES)
-            except BlockingIOError:
-                return newest
+            except TimeoutError:
+                return None
             except OSError:  # an answer bounced: ArduCopter was just ending
                 continue
-            newest = self._physics.receive(data) or newest
+            request = self._physics.receive(data)
+            if request is not None:
+                return request
+        return None
 
     def _reply(self, line: bytes) -> None:
         assert self._peer is not None
+        self._replied_s = time.monotonic()
         with contextlib.suppress(OSError):  # it has ended: the wait for its next request says so
             self._socket.sendto(line, self._peer)

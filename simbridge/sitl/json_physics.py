@@ -7,7 +7,6 @@ the answers are the autopilot's clock, so they start at 0 for each start of the 
 
 from __future__ import annotations
 
-import json
 import struct
 from collections import Counter
 from dataclasses import dataclass
@@ -26,19 +25,18 @@ NO_RETURN_M = 1000.0  # above any RNGFND1_MAX: out of range high
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServoPacket:
-    """One request of the autopilot. pwm_us: (16,) int, 0 where an output is off. is_repeat: asked before; answer again
-    without stepping. is_restart: the autopilot began anew."""
+    """One request of the autopilot. pwm_us: 16 pulse widths, 0 where an output is off. is_repeat: answered before, so
+    it may only be answered again, without stepping. is_restart: the autopilot began anew."""
 
     rate_hz: int
     count: int
-    pwm_us: NDArray[np.int64]
+    pwm_us: tuple[int, ...]
     is_repeat: bool
     is_restart: bool
 
     def controls(self) -> Array:
         """(4,) 0..1 in motor order, 0 for an output that is off."""
-        u: Array = np.clip((self.pwm_us[:MOTORS].astype(np.float64) - PWM_MIN_US) / PWM_SPAN_US, 0.0, 1.0)
-        return u
+        return np.array([min(max((pwm - PWM_MIN_US) / PWM_SPAN_US, 0.0), 1.0) for pwm in self.pwm_us[:MOTORS]])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +70,7 @@ class JsonPhysics:
         if len(datagram) != SERVO_PACKET.size:
             self.dropped["length"] += 1
             return None
-        magic, rate, count, *pwm = SERVO_PACKET.unpack(datagram)
+        magic, rate, count, *_ = fields = SERVO_PACKET.unpack(datagram)
         if magic != MAGIC or rate == 0:
             self.dropped["magic" if magic != MAGIC else "rate"] += 1
             return None
@@ -81,7 +79,7 @@ class JsonPhysics:
         if is_restart:
             self.time_s, self._answered = 0.0, None
         self._count = count
-        return ServoPacket(rate_hz=rate, count=count, pwm_us=np.array(pwm), is_repeat=is_repeat, is_restart=is_restart)
+        return ServoPacket(rate_hz=rate, count=count, pwm_us=fields[3:], is_repeat=is_repeat, is_restart=is_restart)
 
     def reply(self, state: PhysicsState, step_s: float) -> bytes:
         """The answer to the newest request, step_s (> 0) after the one before."""
@@ -101,18 +99,16 @@ class JsonPhysics:
 
 def encode(time_s: float, state: PhysicsState, sends_rangefinder: bool) -> bytes:
     """One line of JSON with a newline at both ends and no space after a colon: the parser wants it so."""
-    line: dict[str, object] = {
-        "timestamp": round(time_s, 6),
-        "imu": {"gyro": _rounded(state.gyro_radps, 6), "accel_body": _rounded(state.accel_mps2, 6)},
-        "position": _rounded(state.position_m, 6),
-        "quaternion": _rounded(state.q_ned_frd_wxyz, 7),
-        "velocity": _rounded(state.velocity_mps, 6),
-        "no_time_sync": 0,
-    }
+    rangefinder = ""
     if sends_rangefinder:
-        line["rng_1"] = NO_RETURN_M if state.rangefinder_m is None else round(state.rangefinder_m, 4)
-    return b"\n" + json.dumps(line, separators=(",", ":")).encode() + b"\n"
+        rangefinder = f',"rng_1":{NO_RETURN_M if state.rangefinder_m is None else round(state.rangefinder_m, 4)}'
+    return (
+        f'\n{{"timestamp":{round(time_s, 6)},"imu":{{"gyro":{_list(state.gyro_radps, 6)},'
+        f'"accel_body":{_list(state.accel_mps2, 6)}}},"position":{_list(state.position_m, 6)},'
+        f'"quaternion":{_list(state.q_ned_frd_wxyz, 7)},"velocity":{_list(state.velocity_mps, 6)},'
+        f'"no_time_sync":0{rangefinder}}}\n'
+    ).encode("ascii")
 
 
-def _rounded(values: Array, digits: int) -> list[float]:
-    return [round(v, digits) for v in values.tolist()]
+def _list(values: Array, digits: int) -> str:
+    return "[" + ",".join([repr(round(v, digits)) for v in values.tolist()]) + "]"

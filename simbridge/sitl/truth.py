@@ -40,10 +40,14 @@ def q_ned_frd_wxyz(q_world_body_wxyz: Array) -> Array:
 
 def rotate_inverse(q_wxyz: Array, vector: Array) -> Array:
     """A vector of the outer frame in the inner one; q inner to outer, unit."""
-    w, axis = q_wxyz[0], -q_wxyz[1:]
-    t = 2.0 * np.cross(axis, vector)
-    rotated: Array = vector + w * t + np.cross(axis, t)
-    return rotated
+    w, x, y, z = q_wxyz.tolist()
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+    a, b, c = vector.tolist()
+    return np.array([r[0] * a + r[1] * b + r[2] * c for r in rows])
 
 
 def magnetic_field_frd_gauss(pose: Pose, noise_gauss: Array) -> Array:

@@ -6,6 +6,7 @@ import json
 import math
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -30,17 +31,19 @@ class StandingPose:
 
 
 class AskingArduCopter(threading.Thread):
-    """Sends its requests one by one, each after an answer. A pair of equal requests asks again, as after a lost answer."""
+    """Sends its requests one by one, each after an answer; the same once more only after again_s, as ArduCopter does."""
 
-    def __init__(self, port: int, requests: list[bytes]) -> None:
+    def __init__(self, port: int, requests: list[bytes], again_s: float = 0.0) -> None:
         super().__init__(daemon=True)
-        self._requests, self._port = requests, port
+        self._requests, self._port, self._again_s = requests, port, again_s
         self.answers: list[dict[str, object]] = []
 
     def run(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
             s.settimeout(3.0)
-            for request in self._requests:
+            for before, request in zip([b"", *self._requests], self._requests, strict=False):
+                if request == before:
+                    time.sleep(self._again_s)
                 s.sendto(request, ("127.0.0.1", self._port))
                 try:
                     self.answers.append(json.loads(s.recv(2048)))
@@ -118,15 +121,36 @@ def test_motors_turn_as_the_recorded_flight_asked(sitl: ArduPilotSitl) -> None:
     assert np.max(got) > 0.4
 
 
-def test_a_request_that_comes_again_is_answered_again_without_a_step(sitl: ArduPilotSitl) -> None:
+def test_a_request_that_comes_again_is_answered_again_without_a_step(
+    sitl: ArduPilotSitl, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ardupilot, "LOST_ANSWER_S", 0.1)
     requests = recorded_requests("armed", 10)
-    peer = AskingArduCopter(sitl.port, [requests[0], requests[1], requests[1], requests[2], requests[3]])
+    peer = AskingArduCopter(sitl.port, [requests[0], requests[1], requests[1], requests[2], requests[3]], 0.2)
     peer.start()
     for i in range(3):
         sitl.step(1_000_000_000 + i * STEP_NS, REST, None, None)
     peer.join(5.0)
     stamps = [a["timestamp"] for a in peer.answers]
     assert stamps == [0.00125, 0.0025, 0.0025, 0.00375]
+
+
+def test_copies_that_piled_up_while_we_were_held_up_are_answered_once(sitl: ArduPilotSitl) -> None:
+    """Each answer too many would be a frame of delay for good."""
+    first, second, third = recorded_requests("armed", 3)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as copter:
+        copter.settimeout(1.0)
+        for _ in range(5):
+            copter.sendto(first, ("127.0.0.1", sitl.port))
+        copter.sendto(second, ("127.0.0.1", sitl.port))
+        copter.sendto(third, ("127.0.0.1", sitl.port))
+        sitl.step(1_000_000_000, REST, None, None)
+        sitl.step(1_000_000_000 + STEP_NS, REST, None, None)
+        stamps = [json.loads(copter.recv(2048))["timestamp"] for _ in range(2)]
+        copter.settimeout(0.1)
+        with pytest.raises(TimeoutError):
+            copter.recv(2048)
+    assert stamps == [0.00125, 0.0025]
 
 
 def test_silence_in_flight_is_motors_off_and_a_restart_goes_on(
