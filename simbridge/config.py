@@ -6,13 +6,13 @@ data-sheet values, this side those and the rest (noise, drop-outs, mount error).
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from simbridge import footprint as fp
 from simbridge.piles import Pile
-from simbridge.section import Finite, NonNegative, Point, Positive, Ratio, Section, Vector
+from simbridge.section import Finite, NonNegative, Point, Positive, Ratio, Section, Vector, refuse
 
 
 class Circle(Section):
@@ -27,7 +27,20 @@ class RoundFootprint(Section):
     sides: int = Field(64, ge=8, le=256)
 
 
-Footprint = RoundFootprint | Annotated[tuple[Point, ...], Field(min_length=3)]
+def _kind_of_footprint(value: Any) -> str | None:
+    if isinstance(value, dict | RoundFootprint):
+        return "round"
+    return "polygon" if isinstance(value, list | tuple) else None
+
+
+Footprint = Annotated[
+    Annotated[RoundFootprint, Tag("round")] | Annotated[tuple[Point, ...], Field(min_length=3), Tag("polygon")],
+    Discriminator(
+        _kind_of_footprint,
+        custom_error_type="footprint",
+        custom_error_message="must be corners [[x, y], ...] in order along the wall, or {circle: {center: [x, y], radius_m: r}}",
+    ),
+]
 
 
 class Pilasters(Section):
@@ -110,7 +123,22 @@ class StartCircle(Section):
     yaw_deg: Finite | None = None
 
 
-Start = StartCircle | Point | Vector
+def _kind_of_start(value: Any) -> str | None:
+    if isinstance(value, dict | StartCircle):
+        return "seeded"
+    if isinstance(value, list | tuple):
+        return {2: "place", 3: "pose"}.get(len(value))
+    return None
+
+
+Start = Annotated[
+    Annotated[StartCircle, Tag("seeded")] | Annotated[Point, Tag("place")] | Annotated[Vector, Tag("pose")],
+    Discriminator(
+        _kind_of_start,
+        custom_error_type="start",
+        custom_error_message="must be [x, y], [x, y, yaw_deg] or {circle: {center: [x, y], radius_m: r}, yaw_deg: optional}",
+    ),
+]
 
 
 class ImuConfig(Section):
@@ -193,15 +221,12 @@ class LidarSimConfig(Section):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         if self.elevation_min_deg >= self.elevation_max_deg:
-            raise ValueError(
-                "elevation_min_deg must be below elevation_max_deg, "
-                f"got {self.elevation_min_deg} and {self.elevation_max_deg}"
-            )
+            reason = f"must be below elevation_max_deg, {self.elevation_max_deg:g}"
+            refuse(("elevation_min_deg",), self.elevation_min_deg, reason)
         if self.min_range_m >= self.max_range_m:
-            raise ValueError(f"min_range_m must be below max_range_m, got {self.min_range_m} and {self.max_range_m}")
-        wrong = [row for row in self.rows_off if not 0 <= row < self.rows]
-        if wrong:
-            raise ValueError(f"rows_off: {wrong} not among the {self.rows} rows; allowed are 0 to {self.rows - 1}")
+            refuse(("min_range_m",), self.min_range_m, f"must be below max_range_m, {self.max_range_m:g}")
+        if not all(0 <= row < self.rows for row in self.rows_off):
+            refuse(("rows_off",), self.rows_off, f"there are {self.rows} rows; allowed are 0 to {self.rows - 1}")
         return self
 
 

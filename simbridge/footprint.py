@@ -11,9 +11,10 @@ import shapely
 from numpy.typing import NDArray
 
 from simbridge import piles
+from simbridge.section import refuse
 
 if TYPE_CHECKING:
-    from simbridge.config import Column, Footprint, Pilasters, Start, WorldConfig
+    from simbridge.config import Box, Column, Footprint, Pilasters, Start, WorldConfig
 
 Array = NDArray[np.float64]
 
@@ -97,18 +98,7 @@ def obstacles(world: WorldConfig) -> tuple[Obstacle, ...]:
         for k, (center, half, yaw) in enumerate(_pilasters(world, spec))
     ]
     found += [_column(f"columns[{i}]", world, column) for i, column in enumerate(world.columns)]
-    found += [
-        _obstacle(
-            f"boxes[{i}]",
-            world,
-            b.center,
-            (b.size_m[0] / 2, b.size_m[1] / 2),
-            math.radians(b.yaw_deg),
-            False,
-            b.size_m[2],
-        )
-        for i, b in enumerate(world.boxes)
-    ]
+    found += [_box(f"boxes[{i}]", world, box) for i, box in enumerate(world.boxes)]
     return tuple(found)
 
 
@@ -117,6 +107,11 @@ def _column(name: str, world: WorldConfig, column: Column) -> Obstacle:
     size = column.size_m or (2.0 * (column.radius_m or 0.0),) * 2
     half = (size[0] / 2, size[1] / 2)
     return _obstacle(name, world, column.center, half, math.radians(column.yaw_deg), is_round, column.height_m)
+
+
+def _box(name: str, world: WorldConfig, box: Box) -> Obstacle:
+    half = (box.size_m[0] / 2, box.size_m[1] / 2)
+    return _obstacle(name, world, box.center, half, math.radians(box.yaw_deg), False, box.size_m[2])
 
 
 def _obstacle(
@@ -157,50 +152,61 @@ def _pilasters(world: WorldConfig, spec: Pilasters) -> list[tuple[tuple[float, f
 
 
 def check_world(world: WorldConfig) -> None:
-    """Raises: ValueError: parts that do not fit together; the text begins with the key and says what is allowed."""
+    """Raises: ValidationError: parts that do not fit together, and what is allowed."""
     hall = outline(world.footprint)
     if not hall.is_valid or hall.area < 1.0:
         reason = shapely.is_valid_reason(hall) if not hall.is_valid else f"its area is {hall.area:.2f} m2"
-        raise ValueError(
-            f"footprint: crosses or touches itself, or is too small ({reason}); "
-            "allowed is a simple polygon: corners in order along the wall, no edge crossing another"
+        refuse(
+            ("footprint",),
+            world.footprint,
+            f"crosses or touches itself, or is too small ({reason}); allowed is a simple polygon: "
+            "corners in order along the wall, no edge crossing another",
         )
     count = len(corners(world.footprint))
     for i, spec in enumerate(world.pilasters):
         if spec.wall != "all" and not 0 <= spec.wall < count:
-            raise ValueError(f"pilasters[{i}].wall: {spec.wall} is no wall; allowed are 0 to {count - 1}, or all")
-    for obstacle in obstacles(world):
-        outside = obstacle.outline().difference(hall.buffer(0.01)).area
-        if outside > 1e-3 and not obstacle.name.startswith("pilasters"):
-            raise ValueError(
-                f"{obstacle.name}: reaches outside the footprint at {obstacle.center}; it must stand within the walls"
-            )
+            refuse(("pilasters", i, "wall"), spec.wall, f"there is no such wall; allowed are 0 to {count - 1}, or all")
+    _check_obstacles(world, hall)
     for i, pile in enumerate(world.piles):
-        _check_pile(f"piles[{i}]", pile, hall)
+        _check_pile(("piles", i), pile, hall)
 
 
-def _check_pile(name: str, pile: piles.Pile, hall: Any) -> None:
+def _check_obstacles(world: WorldConfig, hall: Any) -> None:
+    within = hall.buffer(0.01)
+    for key, standing in (
+        ("columns", [_column("", world, column) for column in world.columns]),
+        ("boxes", [_box("", world, box) for box in world.boxes]),
+    ):
+        for i, obstacle in enumerate(standing):
+            if not within.covers(obstacle.outline()):
+                refuse((key, i), obstacle.center, "reaches outside the footprint; it must stand within the walls")
+
+
+def _check_pile(location: tuple[str, int], pile: piles.Pile, hall: Any) -> None:
     base = piles.outline(pile)
-    inside = base.intersection(hall).area
-    if inside < 0.02 * base.area:
-        raise ValueError(f"{name}: lies outside the footprint; it must stand within the walls, or lean on one")
+    shown = pile.model_dump(exclude_defaults=True)
+    if base.intersection(hall).area < 0.02 * base.area:
+        refuse(location, shown, "lies outside the footprint; it must stand within the walls, or lean on one")
     if not pile.leaning and not hall.buffer(0.05).covers(base):
-        reach = max(hall.distance(shapely.Point(x, y)) for x, y in base.exterior.coords)
-        raise ValueError(
-            f"{name}: reaches up to {reach:.1f} m outside the footprint; move it inward, make it smaller, "
-            "or set leaning: true to let the walls cut it"
+        reach = max(hall.distance(shapely.Point(x, y)) for x, y in shapely.get_coordinates(base))
+        refuse(
+            location,
+            shown,
+            f"reaches up to {reach:.1f} m outside the footprint; move it inward, make it smaller, "
+            "or set leaning: true to let the walls cut it",
         )
 
 
 def check_start(world: WorldConfig, start: Start) -> None:
-    """Raises: ValueError: the vehicle cannot stand there."""
+    """Raises: ValidationError: the vehicle cannot stand there."""
     if isinstance(start, tuple):
         problem = start_problem(world, start[0], start[1])
         if problem:
-            raise ValueError(f"vehicle.start: {problem}")
-    elif start_places(world, start.circle.center, start.circle.radius_m, np.random.default_rng(0), 400).shape[0] == 0:
+            refuse(("vehicle", "start"), start, problem)
+    elif len(start_places(world, start.circle.center, start.circle.radius_m, np.random.default_rng(0), 400)) == 0:
         problem = start_problem(world, *start.circle.center)
-        raise ValueError(f"vehicle.start.circle: no place to stand in it; its centre {problem or 'is the only one'}")
+        shown = start.model_dump(exclude_defaults=True)
+        refuse(("vehicle", "start"), shown, f"no place to stand in the circle: {problem or 'only its very centre'}")
 
 
 def start_places(world: WorldConfig, center: tuple[float, float], radius_m: float, rng: Any, tries: int) -> Array:

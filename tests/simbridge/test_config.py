@@ -14,18 +14,20 @@ BAD_WORLDS: list[tuple[dict[str, Any], str, str]] = [
     ({"footprint": [[0, 0], [20, 0], [0, 12], [20, 12]]}, "footprint", "simple polygon"),
     ({"footprint": [[0, 0], [20, 0]]}, "footprint", "at least 3"),
     ({"footprint": [[0, 0], [20, 0], [20, float("nan")]]}, "footprint", "finite"),
+    ({"footprint": "round"}, "footprint", "{circle: {center"),
+    ({"footprint": {"circle": {"center": [0, 0]}}}, "footprint.round.circle.radius_m", "required"),
     ({"height": 10}, "height", "not permitted"),
     ({"height_m": -3}, "height_m", "greater than"),
     ({"height_m": "10 ft"}, "height_m", "number"),
-    ({"piles": [{**CONE, "center": [60, 6]}]}, "piles[0]", "outside the footprint"),
-    ({"piles": [{**CONE, "center": [19, 6]}]}, "piles[0]", "leaning: true"),
+    ({"piles": [{**CONE, "center": [60, 6]}]}, "piles.0", "outside the footprint"),
+    ({"piles": [{**CONE, "center": [19, 6]}]}, "piles.0", "leaning: true"),
     ({"piles": [{**CONE, "kind": "pyramid"}]}, "piles", "'cone', 'ridge', 'gaussians', 'function', 'mesh'"),
     ({"piles": [{**CONE, "repose_deg": 80}]}, "repose_deg", "less than or equal to 60"),
     ({"piles": [{"kind": "mesh", "file": "nowhere.stl"}]}, "piles", "no such file: nowhere.stl"),
-    ({"columns": [{"center": [21, 5], "radius_m": 0.3}]}, "columns[0]", "within the walls"),
+    ({"columns": [{"center": [21, 5], "radius_m": 0.3}]}, "columns.0", "within the walls"),
     ({"columns": [{"center": [5, 5]}]}, "columns", "radius_m (round) or size_m"),
-    ({"boxes": [{"center": [0, 5], "size_m": [1, 1, 1]}]}, "boxes[0]", "within the walls"),
-    ({"pilasters": [{"wall": 4}]}, "pilasters[0].wall", "0 to 3, or all"),
+    ({"boxes": [{"center": [0, 5], "size_m": [1, 1, 1]}]}, "boxes.0", "within the walls"),
+    ({"pilasters": [{"wall": 4}]}, "pilasters.0.wall", "0 to 3, or all"),
 ]
 
 
@@ -46,6 +48,8 @@ def test_bad_world_is_refused_with_key_and_what_is_allowed(change: dict[str, Any
         ([6, 3], "from columns[0]"),
         ({"circle": {"center": [13, 6], "radius_m": 1}}, "on a pile"),
         ({"circle": {"center": [50, 6], "radius_m": 1}}, "outside the footprint"),
+        ("here", "[x, y, yaw_deg] or {circle"),
+        ([1, 2, 3, 4], "[x, y, yaw_deg] or {circle"),
     ],
 )
 def test_start_where_nothing_can_stand_is_refused(start: Any, reason: str) -> None:
@@ -69,8 +73,8 @@ def test_expression_that_is_not_arithmetic_is_refused(expression: str) -> None:
     [
         ({"rows_off": [5]}, "allowed are 0 to 4"),
         ({"rows": 7}, "5, 16, 32 or 64"),
-        ({"elevation_min_deg": 10.0}, "elevation_min_deg must be below"),
-        ({"min_range_m": 60.0}, "min_range_m must be below"),
+        ({"elevation_min_deg": 10.0}, "must be below elevation_max_deg, 0"),
+        ({"min_range_m": 60.0}, "must be below max_range_m, 50"),
         ({"noise_mm": 3}, "not permitted"),
     ],
 )
