@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 
 from companion import topics
 from companion.config import CompanionConfig
@@ -137,7 +136,7 @@ class Flight:
     def begin_scan(self, scan: LidarScan, t_ns: int) -> Callable[[], ScanResult | None]:
         """The heavy step: level, deskew, register. May run in a thread; one scan at a time. None: nothing to use."""
         self.record("begin", t_ns, b"", None)
-        return partial(self.odometry.on_scan, scan)
+        return self.odometry.begin(scan)
 
     def accept_scan(self, result: ScanResult | None, t_ns: int) -> bool:
         """Take a registered scan in. True if it belongs in the map: then `mapper.add` it, where it holds up nothing."""

@@ -7,7 +7,9 @@ walls of the first keyframe hold the pose for the whole flight.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +83,7 @@ class Odometry:
         self._cfg = cfg
         self._leveller = Leveller(cfg.lidar)
         self._attitude = AttitudeBuffer()
+        self._rangefinder: list[RangefinderSample] = []
         self._snapshot: Snapshot | None = None
         self.walls = WallMap()
         self.height = HeightTracker(cfg.lidar.mount_position_m[2])
@@ -102,9 +105,7 @@ class Odometry:
         self._attitude.add(sample)
 
     def on_rangefinder(self, sample: RangefinderSample) -> None:
-        self.height.on_rangefinder(sample)
-        if np.isfinite(sample.distance_m):
-            self._standstill.on_rangefinder(sample.distance_m)
+        self._rangefinder.append(sample)
 
     def predict(self, t_ns: int) -> OdometryEstimate | None:
         """The estimate at t_ns (not before the newest scan), or None before the first scan. Cheap; any thread."""
@@ -113,9 +114,23 @@ class Odometry:
             return None
         return estimate_at(snapshot, history, max(t_ns, snapshot.t_scan_ns), is_scan=False)
 
+    def begin(self, scan: LidarScan) -> Callable[[], ScanResult | None]:
+        """Freeze what is known now and give the heavy step to run: what arrives while it runs counts for the next one,
+        so that replay can repeat it to the last bit."""
+        samples, self._rangefinder = self._rangefinder, []
+        return partial(self._process, scan, self._attitude.history, samples)
+
     def on_scan(self, scan: LidarScan) -> ScanResult | None:
-        """None when the scan cannot be used at all (counted in `dropped`)."""
-        history = self._attitude.history
+        """Both at once. None when the scan cannot be used at all (counted in `dropped`)."""
+        return self.begin(scan)()
+
+    def _process(
+        self, scan: LidarScan, history: AttitudeHistory | None, samples: list[RangefinderSample]
+    ) -> ScanResult | None:
+        for sample in samples:
+            self.height.on_rangefinder(sample)
+            if np.isfinite(sample.distance_m):
+                self._standstill.on_rangefinder(sample.distance_m)
         if self._is_unusable(scan, history) or history is None:
             return None
         old = self._snapshot
@@ -126,7 +141,8 @@ class Odometry:
         row = scan.geometry.horizontal_row
         layer3 = levelled.points_level[levelled.row == row]
         layer = np.ascontiguousarray(layer3[layer3[:, 2] > self.height.floor_below_m(vertical.x[0]), :2])
-        lower = block_means(levelled, row, scan.range_m.shape[1])
+        near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
+        lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None
         if old is None:
             snapshot = self._first(scan, planar, vertical)
