@@ -106,6 +106,7 @@ class Odometry:
 
     def on_rangefinder(self, sample: RangefinderSample) -> None:
         self._rangefinder.append(sample)
+        del self._rangefinder[:-64]  # without scans nobody takes them
 
     def predict(self, t_ns: int) -> OdometryEstimate | None:
         """The estimate at t_ns (not before the newest scan), or None before the first scan. Cheap; any thread."""
