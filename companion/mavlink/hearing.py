@@ -15,6 +15,7 @@ from companion.mavlink.origin import Origin
 from companion.mavlink.outbox import Outbox
 from companion.mavlink.parameters import Parameters
 from companion.mavlink.px4 import PX4
+from companion.mavlink.px4_events import FAILSAFE_EVENTS
 from companion.mavlink.texts import Texts
 from companion.mavlink.timesync import Timesync
 from companion.mavlink.vehicle import Vehicle
@@ -269,4 +270,7 @@ class Hearing:
         self._journal.add(self._texts.on_text(payload, t_ns))
 
     def _on_event(self, payload: bytes, t_ns: int) -> None:
+        if wire.unpack(wire.EVENT, payload)[0] in FAILSAFE_EVENTS:
+            self.vehicle.t_failsafe_event_ns = t_ns
+            self.vehicle.is_failsafe_told = True
         self._journal.add(self._texts.on_event(payload, t_ns))

@@ -45,3 +45,5 @@ _TEXTS = {
     "mavlink_rcv_odom_unsup_estimator_type": "ODOMETRY refused: its estimator type is not supported",
 }
 EVENT_TEXTS = {event_id(name): text for name, text in _TEXTS.items()}
+# That one took over: known before the heartbeat, which comes once a second, says CRITICAL.
+FAILSAFE_EVENTS = frozenset(event_id(name) for name, text in _TEXTS.items() if text.startswith("Failsafe activated"))

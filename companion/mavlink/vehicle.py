@@ -12,6 +12,7 @@ LOST_AGE_NS = 3_000_000_000
 _ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 _FAILSAFE_STATES = (5, 6)  # MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY
 _REBOOT_FALL_MS = 1000
+_HEARTBEAT_KNOWS_NS = 1_500_000_000  # it comes once a second
 
 
 @dataclass(slots=True)
@@ -40,17 +41,21 @@ class Vehicle:
     wanted_mode: FlightMode | None = None
     pilot_has_control: bool = False
     joined_in_flight: bool = False
+    is_failsafe_told: bool = False  # by an event, since the last heartbeat that could say it itself
+    t_failsafe_event_ns: int = 0
     _link: str = "none"
 
     @property
     def is_failsafe(self) -> bool:
-        return self.system_status in _FAILSAFE_STATES or self.mode is FlightMode.DESCEND
+        return self.system_status in _FAILSAFE_STATES or self.mode is FlightMode.DESCEND or self.is_failsafe_told
 
     def on_heartbeat(
         self, dialect: Dialect, custom_mode: int, base_mode: int, system_status: int, t_ns: int
     ) -> list[Event]:
         self.t_heartbeat_ns = t_ns
         self.system_status = system_status
+        if t_ns - self.t_failsafe_event_ns > _HEARTBEAT_KNOWS_NS:
+            self.is_failsafe_told = False
         was_armed, self.is_armed = self.is_armed, bool(base_mode & _ARMED)
         events = self._arming_events(was_armed, t_ns)
         self.note_custom_mode(custom_mode, t_ns)
