@@ -98,28 +98,45 @@ async def _probe(
     link: VehicleLink, dialect: Dialect, probe: Probe, seconds: float
 ) -> tuple[SentVision, dict[str, float], bool | None, int | None]:
     """Send the test pose, and watch what the estimator makes of it while it goes on."""
-    worst: dict[str, float] = {}
-    seen: list[int] = []
+    seen: list[tuple[int, dict[str, float]]] = []  # each status report after settling
+    counted = 0
 
     async def watch() -> None:
-        begin = time.monotonic()
+        nonlocal counted
+        await asyncio.sleep(_SETTLE_S)
         while True:
-            await asyncio.sleep(0.1)
-            if time.monotonic() - begin < _SETTLE_S:
-                continue
-            for name, ratio in _ratios(link).items():
-                worst[name] = max(worst.get(name, 0.0), ratio)
-            flags = _flags(link, dialect)
-            if flags is not None:
-                seen.append(flags)
+            await asyncio.sleep(0.05)
+            flags, count = _flags(link, dialect), link.counts[_status_name(dialect)]
+            if flags is not None and count != counted:
+                counted = count
+                seen.append((flags, _ratios(link)))
 
     watcher = asyncio.create_task(watch())
     try:
         vision = await send_pose(link, probe, seconds + _SETTLE_S)
     finally:
         watcher.cancel()
-    flags = seen[-1] if seen else _flags(link, dialect)
-    return vision, worst, None if flags is None else dialect.is_vision_fused(flags), flags
+    flags = seen[-1][0] if seen else _flags(link, dialect)
+    return (
+        vision,
+        _lasting([ratios for _, ratios in seen]),
+        None if flags is None else dialect.is_vision_fused(flags),
+        flags,
+    )
+
+
+def _lasting(reports: list[dict[str, float]]) -> dict[str, float]:
+    """The highest that each ratio held for three reports on end: a single high one is a start, not a disagreement."""
+    out: dict[str, float] = {}
+    for name in sorted({name for report in reports for name in report}):
+        values = [report.get(name, 0.0) for report in reports]
+        windows = [min(values[i : i + 3]) for i in range(max(1, len(values) - 2))]
+        out[name] = max(windows)
+    return out
+
+
+def _status_name(dialect: Dialect) -> str:
+    return "ESTIMATOR_STATUS" if dialect is PX4 else "EKF_STATUS_REPORT"
 
 
 def _is_armed(link: VehicleLink) -> bool:
@@ -158,15 +175,19 @@ async def _round_trip(link: VehicleLink) -> float | None:
 
 
 def _flags(link: VehicleLink, dialect: Dialect) -> int | None:
-    name = "ESTIMATOR_STATUS" if dialect is PX4 else "EKF_STATUS_REPORT"
-    newest = link.newest.get(name)
+    newest = link.newest.get(_status_name(dialect))
     return None if newest is None else int(newest["flags"])
 
 
 def _ratios(link: VehicleLink) -> dict[str, float]:
     """PX4's innovation test ratios of what is fused. (ArduPilot's variances do not move with vision.)"""
     newest = link.newest.get("ESTIMATOR_STATUS", {})
-    names = {"velocity": "vel_ratio", "position": "pos_horiz_ratio", "height": "pos_vert_ratio"}
+    names = {
+        "velocity": "vel_ratio",
+        "position": "pos_horiz_ratio",
+        "height": "pos_vert_ratio",
+        "heading": "mag_ratio",
+    }
     found = {name: newest.get(key) for name, key in names.items()}
     return {name: float(r) for name, r in found.items() if isinstance(r, int | float) and math.isfinite(r)}
 

@@ -3,7 +3,6 @@ session through its own link; what is red here is red before arming too."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -152,7 +151,7 @@ def check_parameters(facts: Facts) -> list[Check]:
         met = expected.is_met(value)
         verdict = Verdict.OK if met else Verdict.FAIL if expected.must else Verdict.WARN
         reboot = ", then restart the autopilot" if expected.needs_reboot else ""
-        mend = "" if met else f"Set {name} to {expected.mended(value):g}{reboot} (doctor --apply does it)"
+        mend = "" if met else f"Set {name} to {number(expected.mended(value))}{reboot} (doctor --apply does it)"
         before = next((c for c in checks if c.name == label), None)
         if before is not None and (met or before.verdict is Verdict.FAIL):
             continue  # two demands on one parameter: the worse one is told
@@ -160,7 +159,7 @@ def check_parameters(facts: Facts) -> list[Check]:
             checks.remove(before)
         checks.append(
             Check(
-                name=label, verdict=verdict, actual=f"{value:g}", expected=expected.words, why=expected.why, mend=mend
+                name=label, verdict=verdict, actual=number(value), expected=expected.words, why=expected.why, mend=mend
             )
         )
     return checks
@@ -327,5 +326,6 @@ def check_computer(facts: Facts) -> list[Check]:
     return checks
 
 
-def finite(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
+def number(value: float) -> str:
+    """Short, but whole numbers in full: 5000000, not 5e+06."""
+    return f"{int(value)}" if value == int(value) else f"{value:g}"

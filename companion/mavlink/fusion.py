@@ -100,8 +100,26 @@ def _rate(vision: SentVision, facts: Facts) -> Gate | None:
     )
 
 
-@_of_vision
-def _frame(vision: SentVision, facts: Facts) -> Gate | None:
+def _missing(facts: Facts, part: str, bit: int) -> bool:
+    """PX4 gives no test ratio for a part of the vision that it drops, though its flags say fused: as recorded in
+    wrong_input, part by part."""
+    control = facts.parameters.get("EKF2_EV_CTRL")
+    wanted = control is not None and bool(int(control) & bit)
+    is_told = facts.autopilot == "px4" and facts.is_vision_fused is True and bool(facts.ratios)
+    return wanted and is_told and part not in facts.ratios
+
+
+def _frame(facts: Facts) -> Gate | None:
+    if facts.vision is not None:
+        return _sent_frame(facts.vision, facts)
+    if _missing(facts, "position", 1):
+        return "the position is dropped", "frame_id LOCAL_NED (1)", "What frame_id does the sender of ODOMETRY use?"
+    if _missing(facts, "velocity", 4):
+        return "the velocity is dropped", "child_frame_id BODY_FRD (12)", "What child_frame_id does the sender use?"
+    return None
+
+
+def _sent_frame(vision: SentVision, facts: Facts) -> Gate | None:
     pair = f"frame_id {vision.frame_id}, child_frame_id {vision.child_frame_id}"
     if facts.autopilot == "ardupilot":
         if (vision.frame_id, vision.child_frame_id) == (_ARDUPILOT_FRAME, _ARDUPILOT_CHILD):
@@ -124,11 +142,13 @@ def _estimator_type(facts: Facts) -> Gate | None:
     return number, "VIO (3)", "PX4 takes UNKNOWN, NAIVE, VISION, VIO; MOCAP goes where its EKF does not look"
 
 
-@_of_vision
-def _quaternion(vision: SentVision, facts: Facts) -> Gate | None:
-    if vision.norm_error <= _MAX_NORM_ERROR:
-        return None
-    return f"norm off by {vision.norm_error:.1e}", "at most 1e-5", "PX4 drops the attitude in silence: normalise it"
+def _quaternion(facts: Facts) -> Gate | None:
+    if facts.vision is not None and facts.vision.norm_error > _MAX_NORM_ERROR:
+        off = f"norm off by {facts.vision.norm_error:.1e}"
+        return off, "at most 1e-5", "PX4 drops the attitude in silence: normalise it"
+    if facts.vision is None and _missing(facts, "heading", 8):
+        return "the attitude is dropped", "a quaternion of norm 1, within 1e-5", "Normalise it in double precision"
+    return None
 
 
 @_of_vision

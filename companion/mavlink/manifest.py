@@ -48,7 +48,7 @@ class Expected:
             return " or ".join(f"{a:g}" for a in self.allowed)
         if math.isinf(self.high):
             return f"at least {self.low:g}"
-        return f"at most {self.high:g}" if math.isinf(self.low) else f"{self.low:g} to {self.high:g}"
+        return f"at most {self.high:.9g}" if math.isinf(self.low) else f"{self.low:g} to {self.high:.9g}"
 
     def mended(self, value: float | None) -> float:
         """What to set: bits are added to those that are there."""

@@ -11,7 +11,7 @@ from companion.messages import Event, Severity
 
 _CHUNK = 50
 _MAX_OPEN = 8
-_EVENT_AGAIN_NS = 60_000_000_000
+_AGAIN_NS = 60_000_000_000
 _MAX_TOLD = 256
 
 
@@ -39,9 +39,14 @@ class Texts:
     def __init__(self) -> None:
         self._open: OrderedDict[int, _Open] = OrderedDict()
         self._event_sequence: int | None = None
-        self._told: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._told: OrderedDict[tuple[int, int] | str, int] = OrderedDict()
 
     def on_text(self, payload: bytes, t_ns: int) -> list[Event]:
+        """The text that this ends. The same again is told once a minute: ArduCopter with its origin at altitude 0 says
+        each second on the ground that it has set its field elevation."""
+        return [event for event in self._whole_texts(payload, t_ns) if self._is_news(event.text, t_ns)]
+
+    def _whole_texts(self, payload: bytes, t_ns: int) -> list[Event]:
         severity, text, text_id, sequence = wire.unpack(wire.STATUSTEXT, payload)
         end = text.find(b"\0")
         piece = text if end < 0 else text[:end]
@@ -61,14 +66,20 @@ class Texts:
         event_id, _, sequence, _, _, levels, _ = wire.unpack(wire.EVENT, payload)
         level = levels & 0x0F  # external; 8 and above are PX4's own protocol, not for people
         is_repeated, self._event_sequence = sequence == self._event_sequence, sequence
-        told_ns = self._told.get((event_id, level))
-        if is_repeated or level > Severity.DEBUG or (told_ns is not None and t_ns - told_ns < _EVENT_AGAIN_NS):
+        if is_repeated or level > Severity.DEBUG or not self._is_news((event_id, level), t_ns):
             return []
-        self._told[event_id, level] = t_ns
-        if len(self._told) > _MAX_TOLD:
-            self._told.popitem(last=False)
         text = EVENT_TEXTS.get(event_id, f"PX4 event {event_id} (no text known here)")
         return [Event(t_ns=t_ns, severity=Severity(level), name="autopilot_event", text=text)]
+
+    def _is_news(self, what: tuple[int, int] | str, t_ns: int) -> bool:
+        told_ns = self._told.get(what)
+        if told_ns is not None and t_ns - told_ns < _AGAIN_NS:
+            return False
+        self._told[what] = t_ns
+        self._told.move_to_end(what)
+        if len(self._told) > _MAX_TOLD:
+            self._told.popitem(last=False)
+        return True
 
     def _close(self, text_id: int, t_ns: int) -> Event:
         entry = self._open.pop(text_id)

@@ -43,7 +43,7 @@ def healthy(kind: str = "px4", **changes: Any) -> Facts:
         sensors_health=1 | 2 | 8,
         estimator_flags=511,
         is_vision_fused=True,
-        ratios={"position": 0.1},
+        ratios={"position": 0.1, "velocity": 0.1, "height": 0.1, "heading": 0.1},
         lidar_packets_hz=320.0,
         lidar_sources=("10.0.0.5",),
         clock_drift_s=0.0,
@@ -114,6 +114,16 @@ def test_a_gate_shut_in_part_is_red_though_flags_say_fused() -> None:
     checks = check_fusion(healthy(vision=vision(child_frame_id=14)))
     assert checks[0].verdict is Verdict.FAIL
     assert checks[1].name == "fusion.frame"
+
+
+@pytest.mark.parametrize(("part", "gate"), [("position", "frame"), ("velocity", "frame"), ("heading", "quaternion")])
+def test_a_part_that_px4_drops_is_told_without_knowing_what_was_sent(part: str, gate: str) -> None:
+    """Recorded in wrong_input: flags stay 511, the test ratio of the dropped part is not a number."""
+    facts = healthy(vision=None)
+    facts = replace(facts, ratios={name: ratio for name, ratio in facts.ratios.items() if name != part})
+    checks = check_fusion(facts)
+    assert [c.name for c in checks] == ["fusion", f"fusion.{gate}"]
+    assert not is_green(checks)
 
 
 def test_what_cannot_be_explained_is_said_so() -> None:
