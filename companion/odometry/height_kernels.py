@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.messages import Array
-from companion.odometry import kernels
 from companion.odometry.jit import kernel
 
 WINDOW = 1
@@ -28,6 +27,7 @@ TUKEY = 4.685
 UNKNOWN, GROUND, WALL = 0, 1, 2
 WALL_FOOT_M = 0.7  # a wall point must be this far above the ground to count as one
 WALL_GATE_M = 0.5
+WALL_SPREAD_M = 1.0  # of heights at which a wall must have been seen to count as plumb
 BESIDE_M = 1.2  # where the ground at a wall's foot is not known, it is looked for this far before the wall
 
 
@@ -122,12 +122,7 @@ def classify(
     planes: Array,
     origin: Array,
     cell_m: float,
-    wall_sums: Array,
-    wall_spread: Array,
-    wall_state: NDArray[np.uint8],
-    wall_lines: Array,
-    wall_origin: Array,
-    wall_cell_m: float,
+    standing: Array,
     points: Array,
     pose: Array,
     z_m: float,
@@ -136,13 +131,12 @@ def classify(
     kind: NDArray[np.int64],
     place: NDArray[np.int64],
 ) -> None:
-    """Tell ground from wall for (N, 3) levelled points. kind: out; place: out, cell of the plane or line, -1 none.
+    """Tell ground from wall for (N, 3) levelled points. kind: out; place: out, cell of the ground's plane, -1 none.
 
     A point is a wall's when it lies on the line of a wall seen at many heights and well above the ground there; it is
-    the ground's when no wall is near. What is neither is left out.
+    the ground's when no wall is near. What is neither is left out. standing: (N, 8), kernels.lines_at.
     """
     nx = state.shape[1]
-    wy, wx = wall_state.shape
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(points.shape[0]):
         kind[i], place[i] = UNKNOWN, -1
@@ -151,27 +145,16 @@ def classify(
         z = points[i, 2] + z_m
         height = _height_above(sums, state, planes, origin, cell_m, x, y, z)
         known = math.isfinite(height)
-        jx = math.floor((x - wall_origin[0]) / wall_cell_m)
-        jy = math.floor((y - wall_origin[1]) / wall_cell_m)
-        near_wall = False
-        if 0 <= jx < wx and 0 <= jy < wy:
-            if wall_state[jy, jx] == DIRTY:
-                kernels.fit_line(wall_sums, wall_spread, wall_state, wall_lines, jy, jx)
-            if wall_state[jy, jx] == VALID:
-                line = wall_lines[jy, jx]
-                near_wall = line[kernels.SPREAD] >= min_spread_m
-                across = line[kernels.NX] * (x - line[kernels.CX]) + line[kernels.NY] * (y - line[kernels.CY])
-                tall = line[kernels.SPREAD] >= max(min_spread_m, 1.0)
-                if tall and abs(across) < WALL_GATE_M:
-                    toward = line[kernels.NX] * (pose[0] - x) + line[kernels.NY] * (pose[1] - y)
-                    step = math.copysign(BESIDE_M, toward)
-                    u, v = x + step * line[kernels.NX], y + step * line[kernels.NY]
-                    beside = _height_above(sums, state, planes, origin, cell_m, u, v, z)
-                    if height > WALL_FOOT_M or (not known and beside > WALL_FOOT_M + BESIDE_M):
-                        kind[i], place[i] = WALL, jy * wx + jx
-            elif wall_sums[jy, jx, kernels.W] > 0.0:
-                near_wall = wall_spread[jy, jx, 1] - wall_spread[jy, jx, 0] >= min_spread_m
-        if near_wall:
+        wall = standing[i]
+        if wall[0] == 2.0 and wall[1] >= max(min_spread_m, WALL_SPREAD_M):
+            across = wall[2] * (x - wall[4]) + wall[3] * (y - wall[5])
+            if abs(across) < WALL_GATE_M:
+                step = math.copysign(BESIDE_M, wall[2] * (pose[0] - x) + wall[3] * (pose[1] - y))
+                u, v = x + step * wall[2], y + step * wall[3]
+                beside = _height_above(sums, state, planes, origin, cell_m, u, v, z)
+                if height > WALL_FOOT_M or (not known and beside > WALL_FOOT_M + BESIDE_M):
+                    kind[i] = WALL
+        if wall[0] > 0.0 and wall[1] >= min_spread_m:
             continue
         if not known:
             kind[i] = GROUND
@@ -251,15 +234,9 @@ def _solve_robustly(jac: Array, res: Array, var: Array, prior: Array, iterations
 
 @kernel
 def _wall_rows(
-    wall_lines: Array,
-    points: Array,
-    pose: Array,
-    kind: NDArray[np.int64],
-    place: NDArray[np.int64],
-    sigma_range_m: float,
+    standing: Array, points: Array, pose: Array, kind: NDArray[np.int64], sigma_range_m: float
 ) -> tuple[Array, Array, Array]:
     """Residuals of the points on walls by roll, pitch and a shift (map x, y) of the body."""
-    flat = wall_lines.reshape(-1, kernels.LINE)
     n = np.sum(kind == WALL)
     jac, res, var = np.zeros((n, 4)), np.zeros(n), np.zeros(n)
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -269,13 +246,12 @@ def _wall_rows(
             continue
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
-        q = flat[place[i]]
-        ax, ay = c * q[kernels.NX] + s * q[kernels.NY], -s * q[kernels.NX] + c * q[kernels.NY]
-        res[k] = q[kernels.NX] * (x - q[kernels.CX]) + q[kernels.NY] * (y - q[kernels.CY])
-        jac[k, 0], jac[k, 1], jac[k, 2], jac[k, 3] = -ay * pz, ax * pz, q[kernels.NX], q[kernels.NY]
+        wall = standing[i]
+        ax, ay = c * wall[2] + s * wall[3], -s * wall[2] + c * wall[3]
+        res[k] = wall[2] * (x - wall[4]) + wall[3] * (y - wall[5])
+        jac[k, 0], jac[k, 1], jac[k, 2], jac[k, 3] = -ay * pz, ax * pz, wall[2], wall[3]
         along = (ax * px + ay * py) / max(math.sqrt(px * px + py * py + pz * pz), 1e-6)
-        line = q[kernels.ACROSS] / q[kernels.WEIGHT]
-        var[k] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * line
+        var[k] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * wall[6]
         k += 1
     return jac, res, var
 
@@ -318,7 +294,7 @@ def _ground_rows(
 @kernel
 def fit_height(
     planes: Array,
-    wall_lines: Array,
+    standing: Array,
     points: Array,
     pose: Array,
     z_m: float,
@@ -342,7 +318,7 @@ def fit_height(
     """
     out = np.zeros(4)
     correction, information = np.zeros(3), np.zeros((3, 3))
-    jac, res, var = _wall_rows(wall_lines, points, pose, kind, place, sigma_range_m)
+    jac, res, var = _wall_rows(standing, points, pose, kind, sigma_range_m)
     out[1] = len(res)
     prior = np.zeros((4, 4))
     prior[:2, :2] = tilt_prior

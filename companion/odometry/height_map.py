@@ -70,18 +70,14 @@ class HeightMap:
         kind: NDArray[np.int64] = np.zeros(n, np.int64)
         place: NDArray[np.int64] = np.zeros(n, np.int64)
         min_spread = min(0.6, 0.5 * seen_spread_m)
+        standing = walls.lines_at(points_level, pose)
         hk.classify(
             self.sums,
             self.state,
             self.planes,
             self.origin,
             self.cell_m,
-            walls.sums,
-            walls.spread,
-            walls.state,
-            walls.lines,
-            walls.origin,
-            walls.cell_m,
+            standing,
             points_level,
             pose,
             z_m,
@@ -92,7 +88,7 @@ class HeightMap:
         )
         correction, information, out = hk.fit_height(
             self.planes,
-            walls.lines,
+            standing,
             points_level,
             pose,
             z_m,

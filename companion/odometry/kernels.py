@@ -16,9 +16,9 @@ from companion.messages import Array
 from companion.odometry.jit import kernel
 
 WINDOW = 2
-# sums of a cell: weight, x, y, xx, xy, yy, height, pose variance in x, y, yaw
-W, X, Y, XX, XY, YY, Z, VX, VY, VYAW = range(10)
-SUMS = 10
+# sums of a cell: weight, x, y, xx, xy, yy, pose variance in x, y, yaw
+W, X, Y, XX, XY, YY, VX, VY, VYAW = range(9)
+SUMS = 9
 # a line: normal (2), point on it (2), variance across, weight, variance along, pose variance x, y, yaw, lowest and highest
 # z it was seen at, spread of z over which the same cells were seen
 NX, NY, CX, CY, ACROSS, WEIGHT, ALONG, PX, PY, PYAW, LOW, HIGH, SPREAD = range(13)
@@ -27,8 +27,6 @@ DIRTY, VALID, NO_LINE = 0, 1, 2
 
 MIN_WEIGHT = 5.0
 MAX_SLENDER = 0.35  # variance across / along above which a window holds no line
-HEIGHT_MEMORY_M = 3.0  # a wall is not quite the same higher up: sums from further off than this are capped
-HEIGHT_CAP = 100.0
 ANGULAR_SIGMA_RAD = 0.0015  # of a beam's direction: time stamps, attitude, the sensor's own
 TUKEY = 4.685
 NEIGHBOURS = 4  # on each side of a point
@@ -60,10 +58,6 @@ def insert_points(
         if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
             continue
         s = sums[iy, ix]
-        if s[W] > HEIGHT_CAP and abs(s[Z] / s[W] - z_m) > HEIGHT_MEMORY_M:
-            shrink = HEIGHT_CAP / s[W]
-            for k in range(SUMS):
-                s[k] *= shrink
         x, y = points_map[i, 0], points_map[i, 1]
         if s[W] == 0.0:
             spread[iy, ix, 0] = z_m
@@ -74,7 +68,6 @@ def insert_points(
         s[XX] += x * x
         s[XY] += x * y
         s[YY] += y * y
-        s[Z] += z_m
         s[VX] += variances[0]
         s[VY] += variances[1]
         s[VYAW] += variances[2]
@@ -356,3 +349,39 @@ def register_to_lines(
             out[5 + k] = statistics[2 + k] / statistics[0]
     out[8] = out[2] / max(n, 1)
     return pose, system[:, :3].copy(), out
+
+
+@kernel
+def lines_at(
+    sums: Array,
+    spread: Array,
+    state: NDArray[np.uint8],
+    lines: Array,
+    origin: Array,
+    cell_m: float,
+    points: Array,
+    pose: Array,
+) -> Array:
+    """What stands at each of (N, 3) levelled points: (N, 8) how it is known, height spread, line, variance of the line.
+
+    How it is known: 0 nothing seen there, 1 something without a line, 2 a line: normal (2), point on it (2).
+    """
+    ny, nx = state.shape
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    out = np.zeros((points.shape[0], 8))
+    for i in range(points.shape[0]):
+        x = c * points[i, 0] - s * points[i, 1] + pose[0]
+        y = s * points[i, 0] + c * points[i, 1] + pose[1]
+        ix, iy = math.floor((x - origin[0]) / cell_m), math.floor((y - origin[1]) / cell_m)
+        if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
+            continue
+        if state[iy, ix] == DIRTY:
+            fit_line(sums, spread, state, lines, iy, ix)
+        if state[iy, ix] == VALID:
+            line = lines[iy, ix]
+            out[i, 0], out[i, 1] = 2.0, line[SPREAD]
+            out[i, 2], out[i, 3], out[i, 4], out[i, 5] = line[NX], line[NY], line[CX], line[CY]
+            out[i, 6] = line[ACROSS] / line[WEIGHT]
+        elif sums[iy, ix, W] > 0.0:
+            out[i, 0], out[i, 1] = 1.0, spread[iy, ix, 1] - spread[iy, ix, 0]
+    return out

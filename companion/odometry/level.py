@@ -132,19 +132,27 @@ BLOCK_RAD = math.radians(2.9)  # neighbours of a layer that are averaged: 4 of 5
 BLOCK_SPAN_M = 0.6  # of range, about the block's median, beyond which a return is not the same surface
 
 
-def block_means(levelled: LevelledScan, above_row: int, columns: int) -> Array:
+def block_means(levelled: LevelledScan, above_row: int, columns: int, min_range_m: float) -> Array:
     """(N, 3) means over blocks of neighbouring returns in each layer below `above_row`, levelled frame.
 
     A lone return errs along its beam: its place and its height err together, and planes fitted to such points lean
     along the beams. Averaging takes most of that away.
     """
     size = max(1, round(columns * BLOCK_RAD / (2 * math.pi)))
-    return _block_means(levelled.points_level, levelled.range_m, levelled.row, levelled.column, above_row, size)
+    return _block_means(
+        levelled.points_level, levelled.range_m, levelled.row, levelled.column, above_row, size, min_range_m
+    )
 
 
 @kernel
 def _block_means(
-    points: Array, range_m: Array, row: NDArray[np.int64], column: NDArray[np.int64], above_row: int, size: int
+    points: Array,
+    range_m: Array,
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    above_row: int,
+    size: int,
+    min_range_m: float,
 ) -> Array:
     out = np.empty((len(range_m), 3))
     rows = 0
@@ -167,7 +175,7 @@ def _block_means(
                 if abs(range_m[j] - middle) <= BLOCK_SPAN_M:
                     out[n] += points[j]
                     used += 1
-            if 2 * used >= size:
+            if 2 * used >= size and middle >= min_range_m:
                 out[n] /= used
                 n += 1
             count[k] = 0

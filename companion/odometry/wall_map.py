@@ -1,7 +1,6 @@
 """The map that scans are registered to: walls as lines in a grid, averaged over all that was seen of them.
 
-Nothing is forgotten and all scans weigh alike, so the walls seen first keep anchoring the pose and drift dies out;
-only sums from another height are capped, since a wall is not quite the same higher up.
+Nothing is forgotten and all scans weigh alike, so the walls seen first keep anchoring the pose and drift dies out.
 """
 
 from __future__ import annotations
@@ -104,6 +103,12 @@ class WallMap:
             matched_ratio=float(out[8]),
             scale=float(out[4]),
             map_variance=out[5:8],
+        )
+
+    def lines_at(self, points_level: Array, pose: Array) -> Array:
+        """(N, 8) what stands at each levelled point seen from a pose: see kernels.lines_at."""
+        return kernels.lines_at(
+            self.sums, self.spread, self.state, self.lines, self.origin, self.cell_m, points_level, pose
         )
 
     def _cover(self, points: Array) -> None:
