@@ -10,7 +10,6 @@ import math
 
 from companion.config import CompanionConfig
 from companion.messages import (
-    Event,
     FlightMode,
     LandedState,
     OperatorCommand,
@@ -19,13 +18,13 @@ from companion.messages import (
     Setpoint,
     SetpointKind,
     Severity,
-    VehicleRequest,
 )
 from companion.navigator.find_wall import Island
 from companion.navigator.handshake import Handshake, Progress
 from companion.navigator.interface import FINISHED, IN_FLIGHT, NavigatorInput, NavigatorOutput, NavigatorState
 from companion.navigator.legs import Climb, Descent, Ending, Homeward, Round, Search, Start
 from companion.navigator.motion import STILL, Motion
+from companion.navigator.notes import Notes
 from companion.navigator.route import Path
 from companion.navigator.situation import NOTHING_YET, Lookout
 from companion.navigator.takeover import LANDING_MODES, Loss, Readiness, control_lost
@@ -67,8 +66,7 @@ class Navigator:
         self.state = S.WAIT_READY
         self._before = S.CLIMB  # what HOLDING and INTERRUPTED came from
         self._now = NOTHING_YET
-        self._requests: list[VehicleRequest] = []
-        self._events: list[Event] = []
+        self._notes = Notes(0)
         self._outcome, self._reason = "completed", ""
         self._operator_holds = False
         self._was_found_armed = False
@@ -90,13 +88,13 @@ class Navigator:
 
     def step(self, t_ns: int, inputs: NavigatorInput) -> NavigatorOutput:
         """Take in the newest and decide. Never raises on bad measurements."""
-        self._requests, self._events = [], []
+        self._notes = Notes(t_ns)
         self._now = self._lookout.look(t_ns, inputs)
         self._obey(inputs.commands)
         if self.state is S.WAIT_READY:
             news = self._readiness.note(self._now, inputs)
             if news:
-                self._tell(Severity.NOTICE, "not_ready", news)
+                self._notes.tell(Severity.NOTICE, "not_ready", news)
         elif self.state in IN_FLIGHT:
             self._look_out()
         handler = self._handlers.get(self.state)
@@ -112,11 +110,11 @@ class Navigator:
             if kind is OperatorCommandKind.ABORT:
                 self._abort(source)
             elif self.state is S.ABORTING:
-                self._refuse(kind, "the mission is aborting")
+                self._notes.refuse(kind, "the mission is aborting")
             elif kind is OperatorCommandKind.RESUME:
                 self._resume(source)
             elif self.state not in IN_FLIGHT:
-                self._refuse(kind, "it is not flying this mission")
+                self._notes.refuse(kind, "it is not flying this mission")
             elif kind is OperatorCommandKind.LAND:
                 self._land_here("operator", f"{source} asked to land")
             elif self.state is not S.LAND:
@@ -127,11 +125,11 @@ class Navigator:
         if self.state is S.ABORTING:
             return
         vehicle = self._now.vehicle
-        self._tell(Severity.CRITICAL, "abort", f"abort from {source}")
+        self._notes.tell(Severity.CRITICAL, "abort", f"abort from {source}")
         if vehicle is None or not vehicle.is_armed:
             self._finish(S.ABORTED, "aborted", f"abort from {source} on the ground")
         elif self.state is S.INTERRUPTED and vehicle.mode is FlightMode.MANUAL:
-            self._tell(Severity.NOTICE, "abort_noted", "the pilot flies: noted, nothing is asked of the vehicle")
+            self._notes.tell(Severity.NOTICE, "abort_noted", "the pilot flies: noted, nothing is asked of the vehicle")
         else:
             self._outcome, self._reason, self._land_asked_ns = "aborted", f"abort from {source}", None
             self._go(S.ABORTING, self._reason)
@@ -141,9 +139,9 @@ class Navigator:
         if self.state is S.HOLDING:
             self._operator_holds = False
         elif self.state is not S.INTERRUPTED:
-            self._refuse(OperatorCommandKind.RESUME, "nothing is held")
+            self._notes.refuse(OperatorCommandKind.RESUME, "nothing is held")
         elif vehicle is None or not (vehicle.is_connected and vehicle.is_armed and self._now.vision.is_good):
-            self._refuse(OperatorCommandKind.RESUME, "the vehicle is not armed, not heard, or does not see")
+            self._notes.refuse(OperatorCommandKind.RESUME, "the vehicle is not armed, not heard, or does not see")
         else:
             self._handshake = Handshake(self._now.t_ns, may_arm=False)
             self._outcome, self._reason, self._land_asked_ns = "completed", "", None
@@ -212,7 +210,7 @@ class Navigator:
             return None
         request, progress = self._handshake.step(now.t_ns, now.vehicle)
         if request is not None:
-            self._ask(request)
+            self._notes.ask(request)
         if progress is Progress.GIVEN_UP:
             self._finish(S.FAILED, "not_armed", "the flight controller did not take OFFBOARD or did not arm")
         elif progress is Progress.READY:
@@ -265,13 +263,15 @@ class Navigator:
         motion, ending = self._leg.step(self._now)
         if ending is Ending.ARRIVED:
             self._laps_closed += 1
-            self._tell(Severity.INFO, "lap_closed", f"lap {self._laps_closed} closed")
+            self._notes.tell(Severity.INFO, "lap_closed", f"lap {self._laps_closed} closed")
             self._leg.again()
             if self._laps_closed >= self._cfg.laps:
                 self._go_home("completed", "all laps flown", only_flown=False)
         elif ending is Ending.ISLAND:
             self._islands = (*self._islands, self._leg.island())
-            self._tell(Severity.INFO, "island", "went round something that stands free: looking for the hall's wall")
+            self._notes.tell(
+                Severity.INFO, "island", "went round something that stands free: looking for the hall's wall"
+            )
             if len(self._islands) > MAX_ISLANDS:
                 self._go_home("no_wall", "only free-standing things were found", only_flown=False)
             else:
@@ -304,7 +304,7 @@ class Navigator:
         if vehicle.landed_state is LandedState.ON_GROUND:
             self._ground_ns = self._now.t_ns if self._ground_ns is None else self._ground_ns
             if self._now.t_ns - self._ground_ns > DISARM_AFTER_NS:
-                self._ask(RequestKind.DISARM)
+                self._notes.ask(RequestKind.DISARM)
                 self._ground_ns = self._now.t_ns
         return None
 
@@ -340,7 +340,7 @@ class Navigator:
 
     def _go(self, state: NavigatorState, why: str) -> None:
         self.state, self._state_ns, self._good_ns = state, self._now.t_ns, None
-        self._tell(Severity.INFO, "navigator_state", f"{state.value}: {why}")
+        self._notes.tell(Severity.INFO, "navigator_state", f"{state.value}: {why}")
 
     def _hold(self, why: str) -> None:
         if self.state is not S.HOLDING:
@@ -351,7 +351,7 @@ class Navigator:
         if self.state in OUTWARD | {S.RETURN, S.LAND}:
             self._before = self.state
         self._outcome, self._reason, self._operator_holds, self._disarmed_ns = outcome, why, False, None
-        self._tell(Severity.CRITICAL, outcome, why)
+        self._notes.tell(Severity.CRITICAL, outcome, why)
         self._go(S.INTERRUPTED, why)
 
     def _finish(self, state: NavigatorState, outcome: str, why: str) -> None:
@@ -362,7 +362,7 @@ class Navigator:
         if self.state is S.LAND and self._land_asked_ns is not None:
             return
         self._outcome, self._reason = outcome, why
-        self._tell(Severity.CRITICAL, outcome, why)
+        self._notes.tell(Severity.CRITICAL, outcome, why)
         self._go(S.LAND, why)
         self._ask_to_land()
 
@@ -370,7 +370,7 @@ class Navigator:
         assert self._start is not None
         self._outcome, self._reason = outcome, "" if outcome == "completed" else why
         if outcome != "completed":
-            self._tell(Severity.WARNING, outcome, why)
+            self._notes.tell(Severity.WARNING, outcome, why)
         self._leg = Homeward(self._config, self._start, self._path, only_flown=only_flown)
         self._go(S.RETURN, why)
 
@@ -379,16 +379,7 @@ class Navigator:
         landing = vehicle is not None and vehicle.mode in LANDING_MODES
         if self._land_asked_ns is None or (not landing and t_ns - self._land_asked_ns >= LAND_AGAIN_NS):
             self._land_asked_ns = t_ns
-            self._ask(RequestKind.LAND)
-
-    def _ask(self, kind: RequestKind) -> None:
-        self._requests.append(VehicleRequest(t_ns=self._now.t_ns, kind=kind))
-
-    def _refuse(self, kind: OperatorCommandKind, why: str) -> None:
-        self._tell(Severity.NOTICE, "command_refused", f"{kind.value} refused: {why}")
-
-    def _tell(self, severity: Severity, name: str, text: str) -> None:
-        self._events.append(Event(t_ns=self._now.t_ns, severity=severity, name=name, text=text))
+            self._notes.ask(RequestKind.LAND)
 
     def _output(self, motion: Motion | None) -> NavigatorOutput:
         setpoint = None
@@ -397,12 +388,11 @@ class Navigator:
                 t_ns=self._now.t_ns, kind=SetpointKind.VELOCITY, velocity_map_mps=motion.velocity_mps,
                 yaw_rate_radps=motion.yaw_rate_radps, reason=self.state.value,
             )  # fmt: skip
-        interrupted = self.state is S.INTERRUPTED and self._now.since_s(self._disarmed_ns) > OVER_AFTER_S
-        over = interrupted or self.state in FINISHED
+        over = self.state in FINISHED or self._now.since_s(self._disarmed_ns) > OVER_AFTER_S
         turning = self._round if self.state is S.FOLLOW else None
         share = max(0.0, min(0.99, turning.turned_rad / (2 * math.pi))) if turning is not None else 0.0
         return NavigatorOutput(
-            setpoint=setpoint, requests=tuple(self._requests), events=tuple(self._events), state=self.state,
+            setpoint=setpoint, requests=tuple(self._notes.requests), events=tuple(self._notes.events), state=self.state,
             lap_closed=self._laps_closed >= self._cfg.laps, finished=over,
             is_straight=turning is not None and turning.is_straight,
             progress_ratio=min(1.0, (self._laps_closed + share) / self._cfg.laps),
