@@ -23,6 +23,7 @@ _TEXTS = {
     "check_modes_local_pos": "Not ready: no local position (vision not fused)",
     "check_modes_manual_control": "Not ready: no manual control input",
     "check_modes_mission": "No mission loaded",
+    "check_modes_offboard_no_local_velocity": "Not ready: no local velocity (vision not fused)",
     "check_modes_offboard_signal_lost": "Not ready: no offboard setpoint stream",
     "check_rc_dl_no_dllink": "No ground station connected",
     "commander_arm_denied_resolve_failures": "Arming denied: its own checks fail",
@@ -41,7 +42,9 @@ _TEXTS = {
     "commander_failsafe_enter_warn": "Failsafe warning",
     "commander_landing_detected": "Landing detected",
     "commander_takeoff_detected": "Takeoff detected",
+    "commander_mission_comp_lost": "Connection to the companion lost",
     "commander_unsupported_main_mode": "Mode asked for is not supported",
+    "logger_open_file_time": "Its own log file opened",
     "mavlink_rcv_odom_unsup_estimator_type": "ODOMETRY refused: its estimator type is not supported",
 }
 EVENT_TEXTS = {event_id(name): text for name, text in _TEXTS.items()}
