@@ -182,7 +182,7 @@ class Navigator:
         battery = self._battery.step(now.t_ns, now.vehicle.battery_ratio, home_s)
         if battery is Battery.CRITICAL and self.state is not S.LAND:
             self._land_here("battery_critical", "the battery is nearly empty")
-        elif battery is Battery.LOW and self.state in OUTWARD:
+        elif battery is Battery.LOW and (self.state in OUTWARD or (self.state is S.HOLDING and now.vision.is_good)):
             self._go_home("battery_low", "the battery is needed for the way home", only_flown=True)
 
     # ---- on the ground ----------------------------------------------------------------------------------------------
@@ -371,7 +371,7 @@ class Navigator:
         self._outcome, self._reason = outcome, "" if outcome == "completed" else why
         if outcome != "completed":
             self._notes.tell(Severity.WARNING, outcome, why)
-        self._leg = Homeward(self._config, self._start, self._path, only_flown=only_flown)
+        self._leg, self._operator_holds = Homeward(self._config, self._start, self._path, only_flown=only_flown), False
         self._go(S.RETURN, why)
 
     def _ask_to_land(self) -> None:

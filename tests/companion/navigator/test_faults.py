@@ -262,7 +262,7 @@ def test_found_in_the_air_it_stays_passive_and_only_lands_when_asked(flown_to):
 # ---- 23: battery ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("state", [S.CLIMB, S.FIND_WALL, S.FOLLOW])
+@pytest.mark.parametrize("state", [S.CLIMB, S.FIND_WALL, S.FOLLOW, S.HOLDING])
 def test_a_low_battery_flies_home_and_lands(flown_to, state):
     rig = flown_to(state)
     rig.battery = 0.29
