@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,8 +37,6 @@ async def read_parameters(link: VehicleLink) -> dict[str, float | None]:
     values: dict[str, float | None] = {}
     for name in names:
         values[name] = await _read(param, name)
-        if not values and len(values) > 3:
-            break
     return values
 
 
@@ -58,17 +57,16 @@ async def _read(param: Any, name: str) -> float | None:
 
 
 async def _write(param: Any, name: str, value: float) -> None:
+    """Set by its own type: an integer sent as one to a real parameter is refused. Reading back tells how it went."""
     from mavsdk.asyncio.plugins.param import ParamError, ParamResult
 
+    is_real = False
     try:
-        await param.set_param_int(name, int(value))
+        await param.get_param_int(name)
     except ParamError as error:
-        if error.result != ParamResult.WRONG_TYPE:
-            return  # reading back will tell
-        try:
-            await param.set_param_float(name, value)
-        except ParamError:
-            return
+        is_real = error.result == ParamResult.WRONG_TYPE
+    with contextlib.suppress(ParamError):
+        await (param.set_param_float(name, value) if is_real else param.set_param_int(name, int(value)))
 
 
 async def apply_manifest(link: VehicleLink) -> list[Change]:

@@ -52,7 +52,7 @@ class Expected:
 
     def mended(self, value: float | None) -> float:
         """What to set: bits are added to those that are there."""
-        return float(int(value or 0) | self.bits) if self.bits else self.mend
+        return float(int(value or 0) | int(self.mend)) if self.bits else self.mend
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
