@@ -18,6 +18,7 @@ from simbridge.autopilot.battery import Battery
 from simbridge.autopilot.commander import Commander
 from simbridge.autopilot.controller import Controller, Takeoff
 from simbridge.autopilot.estimator import Estimator
+from simbridge.autopilot.events import Event
 from simbridge.autopilot.inbox import Inbox
 from simbridge.autopilot.landing import LandDetector
 from simbridge.autopilot.missions import Missions
@@ -108,6 +109,7 @@ class Autopilot:
         self._down_mps = math.nan
         self._next_detect_ns = self._rest_ns = 0
         self._told_boot_params = False
+        self._event_sequence = 0
         self._reboot_wanted = False
         self._out: list[tuple[str, bytes]] = []
 
@@ -164,10 +166,14 @@ class Autopilot:
         """PREFLIGHT_REBOOT_SHUTDOWN: after the answer has left."""
         self._reboot_wanted = True
 
-    def tell(self, severity: int, text: str) -> None:
-        """A STATUSTEXT for every link with a ground station."""
+    def tell(self, severity: int, text: str, event: Event | None = None) -> None:
+        """A STATUSTEXT for every link with a ground station, and an EVENT for every link."""
+        if event is not None:
+            self._event_sequence = (self._event_sequence + 1) & 0xFFFF
         for link in self.links.values():
             link.text(severity, text, self.boot_ns)
+            if event is not None:
+                link.event(event, self.boot_ns // 1_000_000, self._event_sequence)
 
     @property
     def landed_state(self) -> int:

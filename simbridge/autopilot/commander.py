@@ -5,8 +5,9 @@ Source: PX4 Commander.cpp, UserModeIntention.cpp, HealthAndArmingChecks, failsaf
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
+from simbridge.autopilot import events
 from simbridge.autopilot.battery import Battery
 from simbridge.autopilot.estimator import Estimator
 from simbridge.autopilot.landing import LandDetector
@@ -23,7 +24,14 @@ DENIED_TEXT = "Arming denied: Resolve system health failures first\t"
 _LADDER = (Mode.LOITER, Mode.RTL, Mode.LAND, Mode.DESCEND)
 _OFFBOARD_LOSS = {0: Mode.POSCTL, 1: Mode.ALTCTL, 2: Mode.STABILIZED, 3: Mode.RTL, 4: Mode.LAND, 5: Mode.LOITER}
 _LINK_LOSS = {1: Mode.LOITER, 2: Mode.RTL, 3: Mode.LAND, 7: Mode.LOITER}
+_ACTION = {Mode.LOITER: 5, Mode.RTL: 6, Mode.LAND: 7, Mode.DESCEND: 8}
 _TEXT_LOW = {1: "Low battery level\t", 2: "Critical battery level\t", 3: "Emergency battery level\t"}
+
+
+class Tell(Protocol):
+    """Says a text to ground stations and an event to every link."""
+
+    def __call__(self, severity: int, text: str, event: events.Event | None = None) -> None: ...
 
 
 class OffboardSignal:
@@ -42,9 +50,7 @@ class OffboardSignal:
 class Commander:
     """Holds the armed state, the mode asked for (`intended`) and the mode in force (`mode`)."""
 
-    def __init__(
-        self, params: ParamStore, ekf: Estimator, land: LandDetector, battery: Battery, tell: Callable[[int, str], None]
-    ) -> None:
+    def __init__(self, params: ParamStore, ekf: Estimator, land: LandDetector, battery: Battery, tell: Tell) -> None:
         self._params, self._ekf, self._land, self._battery, self._tell = params, ekf, land, battery, tell
         self.is_armed = False
         self.mode = self.intended = Mode.LOITER
@@ -67,9 +73,13 @@ class Commander:
 
     def offboard_available(self) -> bool:
         s = self.signal
-        if self.now_ns - s.last_ns > self._params.real("COM_OF_LOSS_T") * 1e9:
+        if self.now_ns - s.last_ns > self._loss_ns:
             return False
         return not ((s.needs_position or s.needs_velocity) and not self._ekf.xy_valid)
+
+    @property
+    def _loss_ns(self) -> float:
+        return self._params.real("COM_OF_LOSS_T") * 1e9
 
     def can_run(self, mode: Mode) -> bool:
         """The mode's requirements are met now. There is no manual control, so manual modes never can."""
@@ -127,7 +137,7 @@ class Commander:
         """DO_SET_MODE by PX4's main and sub mode."""
         mode = by_number(main, sub)
         if isinstance(mode, str):
-            self._tell(CRITICAL, mode)
+            self._tell(CRITICAL, mode, events.unsupported_main_mode())
             return TEMPORARILY_REJECTED
         return self.request_mode(mode)
 
@@ -137,7 +147,7 @@ class Commander:
             return ACCEPTED
         if arm:
             if not force and not self.can_arm():
-                self._tell(CRITICAL, DENIED_TEXT)
+                self._tell(CRITICAL, DENIED_TEXT, events.arming_denied())
                 return TEMPORARILY_REJECTED
             self._arm()
             return ACCEPTED
@@ -153,12 +163,12 @@ class Commander:
         self._has_flown = False
         self._landed_since_ns = -1
         self._warned = 0
-        self._tell(INFO, "Armed by external command\t")
+        self._tell(INFO, "Armed by external command\t", events.armed())
         self._decide()
 
     def _disarm(self, text: str) -> None:
         self.is_armed = False
-        self._tell(INFO, text)
+        self._tell(INFO, text, events.disarmed(by_landing=self._has_flown and self._land.is_landed))
         self._override, self._override_since_ns = None, -1
         if self.intended in (Mode.LAND, Mode.RTL, Mode.TAKEOFF):
             self.intended = self._before_landing
@@ -198,7 +208,9 @@ class Commander:
         if not self.can_run(wanted):
             wanted, is_failsafe = self._fallback(wanted), True
         if is_failsafe and not self.in_failsafe:
-            self._tell(CRITICAL, "Failsafe activated\t")
+            if self.intended is Mode.OFFBOARD and self.now_ns - self.signal.last_ns > self._loss_ns:
+                self._tell(CRITICAL, "No offboard signal\t", events.no_offboard_signal())
+            self._tell(CRITICAL, "Failsafe activated\t", events.failsafe(self.intended.custom_mode, _ACTION[wanted]))
         self.in_failsafe, self.mode = is_failsafe, wanted
 
     def _fallback(self, mode: Mode) -> Mode:
@@ -231,7 +243,7 @@ class Commander:
         if landed != self._was_landed:
             self._was_landed = landed
             if self.is_armed:
-                self._tell(INFO, "Landing detected\t" if landed else "Takeoff detected\t")
+                self._tell(INFO, "Landing detected\t" if landed else "Takeoff detected\t", events.landing(landed))
         if not self.is_armed:
             return
         if not landed:

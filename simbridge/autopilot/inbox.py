@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from simbridge.autopilot import events
 from simbridge.autopilot.commander import (
     ACCEPTED,
     CRITICAL,
@@ -118,7 +119,7 @@ class Inbox:
         sample = from_odometry(frame.fields, stamp)
         if isinstance(sample, Refused):
             if sample.text is not None:
-                self._a.tell(CRITICAL, sample.text)
+                self._a.tell(CRITICAL, sample.text, events.unsupported_estimator(frame.fields["estimator_type"]))
             return
         self._a.ekf.add_vision(sample)
 

@@ -8,6 +8,8 @@ import struct
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
+from simbridge.autopilot.events import LAYOUT as EVENT_LAYOUT
+from simbridge.autopilot.events import Event
 from simbridge.autopilot.streams import NORMAL_HZ, ONBOARD_HZ, PACKERS, SILENT_IDS
 from simbridge.autopilot.timesync import TimeSync
 from simbridge.autopilot.wire import BY_NAME, LAYOUTS, Decoder, Encoder
@@ -121,6 +123,11 @@ class Link:
     def text(self, severity: int, text: str, t_ns: int) -> None:
         """Queue a text; it leaves once this link carries a ground station's heartbeat."""
         self._texts.append((t_ns, severity, text))
+
+    def event(self, event: Event, boot_ms: int, sequence: int) -> None:
+        """Queue one EVENT, broadcast."""
+        values = (event.id, boot_ms & 0xFFFFFFFF, sequence, 0, 0, event.levels, event.arguments)
+        self.out.append(self.encoder.pack(EVENT_LAYOUT, values))
 
     def _send_text(self, t_ns: int) -> None:
         while self._texts and t_ns - self._texts[0][0] > TEXT_AGE_NS and not self.has_ground_station(t_ns):

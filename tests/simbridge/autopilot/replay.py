@@ -47,7 +47,22 @@ def frames(path: Path) -> Iterator[tuple[int, bytes, Any]]:
         frame = data[at + 8 : at + 8 + size]
         at += 8 + size
         message = parser.decode(bytearray(frame))
-        yield t_us, frame, (None if message.get_type().startswith("UNKNOWN") else message)
+        yield t_us, frame, (None if message.get_type().startswith("UNKNOWN") and not is_event(message) else message)
+
+
+def is_event(message: Any) -> bool:
+    """EVENT (410), which pymavlink does not know."""
+    return bool(message.get_type() == "UNKNOWN_410")
+
+
+def event_ids(events: list[Event]) -> list[tuple[float, int, bytes]]:
+    """(time, id, arguments) of each EVENT."""
+    out = []
+    for t, m in events:
+        if not isinstance(m, tuple) and is_event(m):
+            payload = bytes(m.get_msgbuf())[10:-2].ljust(53, b"\0")
+            out.append((t, struct.unpack_from("<I", payload)[0], payload[13:53].rstrip(b"\0")))
+    return out
 
 
 def _arrival_ns(t_ns: int, message: Any) -> int:

@@ -18,6 +18,7 @@ from tests.simbridge.autopilot.replay import (
     Event,
     all_of,
     changes,
+    event_ids,
     modes,
 )
 
@@ -114,6 +115,27 @@ def test_lost_vision_ends_in_descend_when_px4_did() -> None:
     times = {name: t for t, name in modes(out)}
     assert abs(times["DESCEND"] - 86.53) <= FAILSAFE_S
     assert abs(modes(out)[-1][0] - 94.57) <= DISARM_S
+
+
+EVENTS = {
+    26266355: ("armed", 0.05),
+    21054825: ("take-off detected", 0.3),
+    31382480: ("failsafe", FAILSAFE_S),
+    29547634: ("failsafe, autopilot disengaged", FAILSAFE_S),
+    26622124: ("landing detected", DISARM_S),
+    32794487: ("disarmed", DISARM_S),
+}
+
+
+@pytest.mark.parametrize("flight", ["ev_offboard", "setpoint_loss", "vision_loss"])
+def test_events_say_what_px4s_said_when_it_said_it(flight: str) -> None:
+    conversation, out = run(flight)
+    recorded = [row for row in event_ids(conversation.recorded) if row[1] in EVENTS]
+    emulated = [row for row in event_ids(out) if row[1] in EVENTS]
+    assert [row[1:] for row in emulated] == [row[1:] for row in recorded]
+    for (t_emulated, number, _), (t_recorded, _, _) in zip(emulated, recorded, strict=True):
+        name, tolerance_s = EVENTS[number]
+        assert abs(t_emulated - t_recorded) <= tolerance_s, name
 
 
 def test_between_origin_and_vision_the_position_reads_as_recorded() -> None:
