@@ -40,6 +40,7 @@ class Dialect:
     timesync_answers: how many of its TIMESYNC questions must be answered before it believes our time stamps.
     decode_mode: the mode in our words. is_vision_fused, is_position_valid: from the estimator's flags.
     has_bytewise_parameters: integers lie in the bytes of PARAM_VALUE's float.
+    max_round_trip_ns: slower TIMESYNC exchanges are not used.
     needs_takeoff: leaves the ground only by NAV_TAKEOFF, not by a velocity setpoint.
     """
 
@@ -50,6 +51,7 @@ class Dialect:
     mode_params: Mapping[FlightMode, tuple[float, float, float]]
     streams_hz: tuple[tuple[int, float], ...]
     timesync_answers: int
+    max_round_trip_ns: int
     has_bytewise_parameters: bool
     needs_takeoff: bool
     estimator_message: int

@@ -108,6 +108,7 @@ class Hearing:
         """The handshake, with an autopilot met for the first time or anew after its restart."""
         self.dialect = dialect
         self._commands.clear()
+        self.timesync.max_round_trip_ns = dialect.max_round_trip_ns
         self.timesync.restart()
         self.origin.restart(t_ns)
         self._parameters.restart(dialect.name, is_bytewise=dialect.has_bytewise_parameters)

@@ -74,6 +74,7 @@ PX4 = Dialect(
         # POSITION_TARGET_LOCAL_NED, HIGHRES_IMU, ALTITUDE, VIBRATION, ESC_INFO, ESC_STATUS, ODOMETRY
         *((unused, 0.0) for unused in (30, 36, 33, 74, 83, 85, 105, 141, 241, 290, 291, wire.ODOMETRY)),
     ),
+    max_round_trip_ns=10_000_000,  # lib/timesync: MAX_RTT_SAMPLE
     timesync_answers=500,  # lib/timesync: CONVERGENCE_WINDOW
     has_bytewise_parameters=True,
     needs_takeoff=False,

@@ -312,6 +312,7 @@ class MavlinkSession:
             and dialect.is_position_valid(flags),
             is_ready_to_arm=not reasons,
             not_ready_because=reasons,
+            is_vision_fused=dialect is None or flags is None or dialect.is_vision_fused(flags),
         )
 
     def _reasons(self, t_ns: int) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ class Timesync:
 
     def __init__(self) -> None:
         self.t_next_ns = 0
+        self.max_round_trip_ns = MAX_ROUND_TRIP_NS
         self.restart()
 
     def restart(self) -> None:
@@ -54,7 +55,7 @@ class Timesync:
             return None
         self._asked.remove(ts1)
         round_trip = t_ns - ts1
-        if not 0 <= round_trip < MAX_ROUND_TRIP_NS:
+        if not 0 <= round_trip < self.max_round_trip_ns:
             self.slow += 1
             return None
         self._add(_Exchange(round_trip, ts1 + round_trip // 2 - tc1))
@@ -93,7 +94,9 @@ class Timesync:
     def missing(self, answers_needed: int) -> str | None:
         """Why the clocks are not yet taken for synchronised; None when they are."""
         if self.good < GOOD_EXCHANGES:
-            slow = f", {self.slow} slower than 10 ms were not used" if self.slow else ""
+            slow = (
+                f", {self.slow} slower than {self.max_round_trip_ns // 1_000_000} ms were not used" if self.slow else ""
+            )
             return f"time sync: {self.good} of {GOOD_EXCHANGES} of our questions answered in time{slow}"
         if self.answered < answers_needed:
             return (
