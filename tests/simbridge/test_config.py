@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
+import trimesh
+import yaml
 from pydantic import ValidationError
 
 from simbridge.config import LidarSimConfig, SimConfig, WorldConfig
@@ -92,3 +95,14 @@ def test_config_cannot_be_changed_after_loading() -> None:
 def test_config_survives_a_round_trip_through_json() -> None:
     cfg = sim_config(world={"piles": [CONE], "columns": [{"center": [6, 3.5], "radius_m": 0.3}]})
     assert SimConfig.model_validate_json(cfg.model_dump_json()) == cfg
+
+
+def test_store_described_in_the_documentation_is_accepted(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "worlds.md").read_text(encoding="utf-8")
+    example = yaml.safe_load(page.split("```yaml\n")[1].split("```")[0])
+    trimesh.creation.cone(radius=3000.0, height=2000.0).export(tmp_path / "heap.stl")
+    for pile in example["world"]["piles"]:
+        if pile["kind"] == "mesh":
+            pile["file"] = str(tmp_path / pile["file"])
+    cfg = SimConfig.model_validate(example)
+    assert {pile.kind for pile in cfg.world.piles} == {"cone", "ridge", "gaussians", "function", "mesh"}
