@@ -143,6 +143,7 @@ class VehicleState:
     is_position_valid: bool
     is_ready_to_arm: bool
     not_ready_because: tuple[str, ...] = ()
+    is_vision_fused: bool = True  # as far as it says; PX4 shows a loss within 0.6 s, ArduPilot after 7 s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

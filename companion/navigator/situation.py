@@ -45,14 +45,16 @@ class Lookout:
         self._last = NOTHING_YET
 
     def look(self, t_ns: int, inputs: NavigatorInput) -> Situation:
-        vision = self._watch.step(t_ns, inputs.estimate, inputs.walls)
+        vehicle = inputs.vehicle
+        is_fused = vehicle is None or not vehicle.is_armed or vehicle.is_vision_fused
+        vision = self._watch.step(t_ns, inputs.estimate, inputs.walls, is_fused=is_fused)
         pose, z, view, view_pose = self._last.pose, self._last.z_m, None, self._last.view_pose
         if inputs.estimate is not None and vision.is_good:
             pose, z = self._place(inputs.estimate)
             if inputs.walls is not None and inputs.walls.t_ns > self._scan_ns:
                 self._scan_ns = inputs.walls.t_ns
                 view, view_pose = ScanView.of(inputs.walls), self._pose_at(inputs.walls.t_ns)
-        self._last = Situation(t_ns, inputs.vehicle, vision, pose, z, view, view_pose)
+        self._last = Situation(t_ns, vehicle, vision, pose, z, view, view_pose)
         return self._last
 
     def _place(self, estimate: OdometryEstimate) -> tuple[Pose2, float]:

@@ -16,6 +16,7 @@ RATE_SCANS = (10, 100)  # a second, and FAULTS row 3's hundred scans
 RATE_SHARE = 0.9
 SLOW_RATIO = 0.5
 UNCERTAIN = "the position is uncertain"
+NOT_FUSED = "the flight controller does not use the vision"
 JUMP_M = 1.0  # a restart of odometry that moves the pose by more makes the flown path worthless
 MIN_ENERGY_S = 30.0  # flown before the drain of the battery is believed
 
@@ -43,10 +44,13 @@ class VisionWatch:
         self._usable_ns: int | None = None
         self._last: OdometryEstimate | None = None
 
-    def step(self, t_ns: int, estimate: OdometryEstimate | None, walls: WallRanges | None) -> Vision:
+    def step(
+        self, t_ns: int, estimate: OdometryEstimate | None, walls: WallRanges | None, *, is_fused: bool = True
+    ) -> Vision:
+        """is_fused: whether the flight controller flies on it; what we see is of no use if it does not."""
         if walls is not None and (not self._scans or walls.t_ns > self._scans[-1]):
             self._scans.append(walls.t_ns)
-        why = self._poor(t_ns, estimate, walls)
+        why = self._poor(t_ns, estimate, walls) or ("" if is_fused else NOT_FUSED)
         jumped = estimate is not None and self._jumped(estimate)
         self._last = estimate if estimate is not None else self._last
         degenerate = estimate is not None and estimate.is_degenerate

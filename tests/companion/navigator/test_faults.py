@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 
 import numpy as np
@@ -236,6 +237,29 @@ def test_a_lost_link_is_held_then_left_silent(flown_to, state):
     assert all(is_still(s) for t, s in trace if t > 2.1)
     assert all(s is None or s.kind is SetpointKind.SILENT for t, s in trace if t > 3.1)
     assert rig.output.state is S.INTERRUPTED
+
+
+@pytest.mark.parametrize("state", [s for s in IN_THE_AIR if s is not S.LAND])
+def test_vision_that_the_flight_controller_no_longer_fuses_holds_then_lands(flown_to, state):
+    """It dead-reckons then: real PX4 for 4.6 s, and what we see is of no use to it (docs/safety.md)."""
+    rig = flown_to(state)
+    said = rig.vehicle
+    rig.vehicle = lambda: dataclasses.replace(said(), is_vision_fused=False)
+    trace = run(rig, 2.5)
+    assert all(is_still(s) for t, s in trace if t > 0.1)
+    assert RequestKind.LAND in asked(rig)
+
+
+def test_vision_fused_again_within_a_second_is_flown_on(flown_to):
+    rig = flown_to(S.FOLLOW)
+    said = rig.vehicle
+    rig.vehicle = lambda: dataclasses.replace(said(), is_vision_fused=False)
+    run(rig, 0.8)
+    assert rig.output.state is S.HOLDING
+    rig.vehicle = said
+    run(rig, 3.0)
+    assert rig.output.state is S.FOLLOW
+    assert RequestKind.LAND not in asked(rig)
 
 
 @pytest.mark.parametrize("state", ON_THE_GROUND)
