@@ -38,7 +38,7 @@ def _world() -> World:
 
 
 class Rig:
-    """Steps vehicle and autopilot; keeps every message that the autopilot sent, as (time in s, message)."""
+    """Steps vehicle and autopilot; keeps every frame that the autopilot sent on the offboard link, with its time in s."""
 
     def __init__(
         self, params: dict[str, float] | None = None, seed: int = 1, links: tuple[str, ...] = ("offboard",)
@@ -50,7 +50,7 @@ class Rig:
         self.t_ns = S
         self.mav = dialect.MAVLink(None, srcSystem=1, srcComponent=191)
         self._parser = dialect.MAVLink(None)
-        self.sent: list[tuple[float, Any]] = []
+        self.frames: list[tuple[float, bytes]] = []
         self._rng = np.random.default_rng(seed)
         self.start_position = self.vehicle.position.copy()
         self.vision = True
@@ -104,9 +104,8 @@ class Rig:
         self.t_ns = t + STEP_NS
         for link, frame in self.autopilot.take_output():
             self.on_output(link, frame)
-            if link != "offboard":
-                continue
-            self.sent += [(t / S, m) for m in self._parser.parse_buffer(frame) or []]
+            if link == "offboard":
+                self.frames.append((t / S, frame))
 
     # truth
 
@@ -167,11 +166,11 @@ class Rig:
 
     def command(self, number: int, *params: float) -> int:
         """Send a COMMAND_LONG; its result."""
-        before = len(self.sent)
+        before = len(self.frames)
         values = [*params, *[0.0] * (7 - len(params))]
         self.send(dialect.MAVLink_command_long_message(1, 1, number, 0, *values))
         self.step()
-        acks = [m for _, m in self.sent[before:] if m.get_type() == "COMMAND_ACK" and m.command == number]
+        acks = [m for _, m in self.messages("COMMAND_ACK", before) if m.command == number]
         assert len(acks) == 1
         return int(acks[0].result)
 
@@ -181,8 +180,10 @@ class Rig:
     def arm(self) -> int:
         return self.command(400, 1.0)
 
-    def messages(self, name: str) -> list[tuple[float, Any]]:
-        return [(t, m) for t, m in self.sent if m.get_type() == name]
+    def messages(self, name: str, first: int = 0) -> list[tuple[float, Any]]:
+        """What the autopilot sent on the offboard link of one kind: (time in s, message). first: index into `frames`."""
+        number = getattr(dialect, f"MAVLINK_MSG_ID_{name}").to_bytes(3, "little")
+        return [(t, self._parser.decode(bytearray(f))) for t, f in self.frames[first:] if f[7:10] == number]
 
     def takeoff(self, height_m: float) -> None:
         """Vision on, fused and stable, then arm and climb by velocity setpoints to a height, and stop there."""

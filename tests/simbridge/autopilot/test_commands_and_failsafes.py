@@ -183,7 +183,7 @@ def test_a_reboot_starts_time_anew_keeps_parameters_and_never_arms() -> None:
     rig.send(dialect.MAVLink_param_set_message(1, 1, b"MPC_XY_CRUISE", 3.0, 9))
     assert rig.command(246, 1.0) == 0
     rig.fly(2.0)
-    silent = [t for t, _ in rig.sent if t > rig.t_s - 1.5]
+    silent = [t for t, _ in rig.frames if t > rig.t_s - 1.5]
     assert silent == []
     rig.fly(3.0)
     times = [m.time_boot_ms for _, m in rig.messages("LOCAL_POSITION_NED")]

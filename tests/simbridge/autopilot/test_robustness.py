@@ -50,7 +50,7 @@ HANDLED = (
 
 
 @given(st.sampled_from(HANDLED), st.data())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_any_field_values_are_survived(name: str, data: st.DataObject) -> None:
     layout = BY_NAME[name]
     raw = data.draw(st.binary(min_size=layout.struct.size, max_size=layout.struct.size))
