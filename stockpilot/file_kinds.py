@@ -11,6 +11,7 @@ from pathlib import Path
 from companion.errors import FileFormatError
 from companion.lidar.pcap import is_capture
 from companion.recording.mcap_write import MAGIC
+from companion.recording.packed import MAGIC as PACKED_MAGIC
 from companion.recording.run_files import recording_path
 
 HEAD_BYTES = 65536
@@ -19,6 +20,7 @@ CARMEN_WORDS = (b"FLASER", b"RLASER", b"ROBOTLASER1", b"RAWLASER1", b"ODOM", b"P
 
 class FileKind(Enum):
     MCAP = "MCAP"
+    PACKED = "packed recording"
     PCAP = "packet capture"
     TLOG = "MAVLink tlog"
     ROS1 = "ROS 1 bag"
@@ -43,6 +45,8 @@ def file_kind(path: Path) -> tuple[FileKind, Path]:
     head = _unpacked(raw)
     if head.startswith(MAGIC):
         return FileKind.MCAP, path
+    if head.startswith(PACKED_MAGIC):
+        return FileKind.PACKED, path
     if is_capture(head):
         return FileKind.PCAP, path
     if head.startswith(b"#ROSBAG V2.0"):

@@ -13,8 +13,8 @@ import typer
 from companion.lidar.ouster import OusterDecoder
 from companion.lidar.pcap import PcapReader
 from companion.recording import manifest
-from companion.recording.mcap_read import Attachment, Message, Metadata
-from companion.recording.run_files import scan_of
+from companion.recording.mcap_read import Attachment, Message, Metadata, open_mcap
+from companion.recording.run_files import read_run
 from companion.recording.tlog import read_tlog
 from stockpilot.file_kinds import FileKind, file_kind
 from stockpilot.scan_files import carmen_lines, metadata_beside, open_bag
@@ -100,6 +100,7 @@ def contents_of(path: Path) -> Contents:
     found = Contents(file, kind)
     readers = {
         FileKind.MCAP: _read_mcap,
+        FileKind.PACKED: _read_packed,
         FileKind.PCAP: _read_pcap,
         FileKind.TLOG: _read_tlog,
         FileKind.ROS1: _read_bag,
@@ -147,7 +148,7 @@ def describe(said: dict[str, Any]) -> str:
 
 
 def _read_mcap(found: Contents) -> None:
-    scan = scan_of(found.path)
+    scan = open_mcap(found.path)
     for item in scan:
         if isinstance(item, Message):
             schema = scan.schemas.get(item.channel.schema_id)
@@ -166,6 +167,13 @@ def _read_mcap(found: Contents) -> None:
     found.problems += [f"damage at byte {d.offset}: {d.what}" for d in scan.damage]
     if not scan.is_finished:
         found.problems.append("it was not closed: stockpilot recover rebuilds it")
+
+
+def _read_packed(found: Contents) -> None:
+    run = read_run(found.path)
+    for item in run.inputs:
+        found.stream("in/" + item.kind, "input").add(item.t_ns, len(item.data))
+    found.labels.update(run.metadata.get("run", {}))
 
 
 def _read_pcap(found: Contents) -> None:

@@ -21,8 +21,7 @@ from companion.lidar.ouster import OusterDecoder
 from companion.lidar.pcap import PcapReader
 from companion.messages import Array, LidarScan
 from companion.recording import channels
-from companion.recording.mcap_read import Attachment, McapScan, Message
-from companion.recording.run_files import scan_of
+from companion.recording.mcap_read import Attachment, McapScan, Message, open_mcap
 from stockpilot.file_kinds import FileKind, file_kind
 
 HORIZONTAL_BAND_RAD = math.radians(1.5)  # of a 3D scan, what is nearer to the horizon than this makes the planar scan
@@ -165,7 +164,7 @@ def _open_mcap(path: Path, topic: str | None) -> ScanFile:
     metadata: str | None = None
     wanted: set[str] = set()
     own = channels.INPUT_PREFIX + "lidar"
-    for item in scan_of(path):
+    for item in open_mcap(path):
         if isinstance(item, Attachment) and item.name == "lidar.json":
             metadata = item.data.decode()
         elif isinstance(item, Message) and item.channel.topic not in wanted:
@@ -178,14 +177,14 @@ def _open_mcap(path: Path, topic: str | None) -> ScanFile:
         decoder = OusterDecoder(metadata)
         scans = _own_scans(path, decoder)
         return ScanFile(kind=FileKind.MCAP, sensor="Ouster packets of a flight", scans=scans, dropped=decoder.dropped)
-    scan = scan_of(path)
+    scan = open_mcap(path)
     return ScanFile(
         kind=FileKind.MCAP, sensor=topic or "LaserScan or PointCloud2", scans=_ros_mcap(scan, path, topic), dropped={}
     )
 
 
 def _own_scans(path: Path, decoder: OusterDecoder) -> Iterator[FileScan]:
-    for item in scan_of(path):
+    for item in open_mcap(path):
         if isinstance(item, Message) and item.channel.topic == channels.INPUT_PREFIX + "lidar":
             raw = channels.unpack_raw(item.data)
             for scan in decoder.receive(raw.data, item.t_ns, raw.source):

@@ -71,7 +71,7 @@ def channel_record(channel: Channel) -> bytes:
 class McapWriter:
     """Turns messages into an MCAP file, a chunk at a time, through `sink`. The same calls give the same bytes."""
 
-    def __init__(self, sink: Callable[[bytes], object], *, chunk_bytes: int = CHUNK_BYTES, library: str = "stockpilot"):
+    def __init__(self, sink: Callable[[bytes], object], *, chunk_bytes: int = CHUNK_BYTES):
         self._sink = sink
         self._chunk_limit = chunk_bytes
         self._offset = 0
@@ -88,7 +88,7 @@ class McapWriter:
         self._attachment_indexes: list[bytes] = []
         self._metadata_indexes: list[bytes] = []
         self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
-        self._emit(MAGIC + record(HEADER, text("") + text(library)))
+        self._emit(MAGIC + record(HEADER, text("") + text("stockpilot")))
 
     @property
     def pending_bytes(self) -> int:

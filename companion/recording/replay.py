@@ -17,7 +17,7 @@ from companion.flight import Flight
 from companion.messages import LidarScan, OperatorCommand, OperatorCommandKind
 from companion.odometry import ScanResult
 from companion.recording import channels, codec
-from companion.recording.run_files import Input
+from companion.recording.run_types import Input
 
 SCAN_QUEUE = topics.SCAN.queue
 

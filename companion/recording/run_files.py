@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
-import lzma
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 from companion.errors import FileFormatError
 from companion.recording import channels
 from companion.recording.log import MCAP_NAME
-from companion.recording.mcap_read import Attachment, McapScan, Message, Metadata, open_mcap
+from companion.recording.mcap_read import Attachment, Message, Metadata, open_mcap
+from companion.recording.packed import SUFFIX, unpack
+from companion.recording.run_types import Input, RunRecording
 
+__all__ = ["PACKED_NAME", "Input", "RunRecording", "iter_inputs", "read_run", "recording_path"]
 
-class Input(NamedTuple):
-    """One call into the flight core. kind: one of channels.INPUTS."""
-
-    kind: str
-    t_ns: int
-    data: bytes
-    source: tuple[str, int] | None = None
-
-
-@dataclass(slots=True)
-class RunRecording:
-    """inputs, and outputs and topics as (time, bytes) for comparison; metadata by name; attachments by name."""
-
-    inputs: list[Input] = field(default_factory=list)
-    topics: dict[str, list[tuple[int, bytes]]] = field(default_factory=dict)
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    is_whole: bool = True
-    damage: list[str] = field(default_factory=list)
+PACKED_NAME = "recording" + SUFFIX
 
 
 def recording_path(path: Path) -> Path:
@@ -42,33 +24,30 @@ def recording_path(path: Path) -> Path:
         if not path.exists():
             raise FileFormatError(f"{path}: no such file or folder; expected a run's folder or its {MCAP_NAME}")
         return path
-    for name in (MCAP_NAME, MCAP_NAME + ".xz"):
+    for name in (MCAP_NAME, PACKED_NAME):
         if (path / name).exists():
             return path / name
     raise FileFormatError(f"{path}: has no {MCAP_NAME}; was the run recorded?")
 
 
-def scan_of(path: Path) -> McapScan:
-    """The scan of an MCAP file, which may be packed with xz (as the small recordings under missions/replays are)."""
-    if path.suffix == ".xz":
-        try:
-            return McapScan(lzma.decompress(path.read_bytes()))
-        except (lzma.LZMAError, OSError) as error:
-            raise FileFormatError(f"{path}: expected a file packed with xz: {error}") from None
-    return open_mcap(path)
-
-
 def iter_inputs(path: Path) -> Iterator[Input]:
     """The calls into the flight core, in the order in which they were made."""
-    for item in scan_of(recording_path(path)):
+    file = recording_path(path)
+    if file.name.endswith(SUFFIX):
+        yield from unpack(file.read_bytes()).inputs
+        return
+    for item in open_mcap(file):
         if isinstance(item, Message) and item.channel.topic.startswith(channels.INPUT_PREFIX):
             yield _input(item)
 
 
 def read_run(path: Path) -> RunRecording:
     """All of a recording. Raises: FileFormatError: it is none of ours."""
+    file = recording_path(path)
+    if file.name.endswith(SUFFIX):
+        return unpack(file.read_bytes())
     run = RunRecording()
-    scan = scan_of(recording_path(path))
+    scan = open_mcap(file)
     for item in scan:
         if isinstance(item, Message):
             topic = item.channel.topic
