@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import ndimage
 
@@ -11,6 +13,7 @@ from companion.volume.doubt import doubt
 from companion.volume.floor import Floor, fit_floor, level_floor
 from companion.volume.grid import Grid, Mask, cells_of, disc, grid_around
 from companion.volume.interval import Evidence, error_budget, interval
+from companion.volume.objects import find_objects
 from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells
 from companion.volume.walls import Footprint, find_footprint
 
@@ -66,6 +69,15 @@ def _report(
     x, y = grid.centres()
     floor_z = np.where(footprint.share > 0, floor.z(x, y), np.nan)
     height = np.nan_to_num(surface.z_m - floor_z)
+    inside = footprint.share > 0
+    trusted = inside & (footprint.depth_m > footprint.margin_m + 2 * grid.cell_m) & ~footprint.blocked
+    objects = find_objects(grid, height, inside, trusted)
+    footprint = replace(
+        footprint,
+        share=np.where(objects.cells, 0.0, footprint.share),
+        obstacle_area_m2=footprint.obstacle_area_m2 + float(objects.cells.sum()) * grid.cell_area_m2,
+        warnings=(*footprint.warnings, *objects.warnings),
+    )
     pile = pile_mask(height, footprint.share > 0, cells, grid)
     area = grid.cell_area_m2 * footprint.share
     volume = float(np.sum((height * area)[pile]))
@@ -87,7 +99,8 @@ def _report(
     )
     total = float(area.sum())
     ratio = {s: float(area[surface.state == s].sum()) / total for s in CellState}
-    doubts = doubt(evidence, footprint, cells, floor, point_map, volume, ratio[CellState.UNSEEN])
+    steep_m3 = float(np.sum((np.maximum(height, 0.0) * area)[objects.steep & pile]))
+    doubts = doubt(evidence, footprint, cells, floor, point_map, volume, ratio[CellState.UNSEEN], steep_m3)
     budget = error_budget(evidence) | {"doubt": doubts.sigma_m3}
     return VolumeReport(
         volume_m3=volume,

@@ -67,7 +67,7 @@ def robust_cells(points: Array, key: Index, grid: Grid) -> Cells:
     gx, gy = (np.nan_to_num(g).ravel() for g in (planes.slope_x, planes.slope_y))
     r = p[:, 2] - median.ravel()[k] - gx[k] * (p[:, 0] - x.ravel()[k]) - gy[k] * (p[:, 1] - y.ravel()[k])
     scale = _scale(r, k, grid, n)
-    keep = np.abs(r) < 3.5 * scale.ravel()[k]
+    keep = (np.abs(r) < 3.5 * scale.ravel()[k]) & ~_upright(scale, n, grid).ravel()[k]
     x, y, z, n = _means(p, k, grid, keep)
     flat = n.ravel()
     square = np.bincount(k[keep], (r[keep]) ** 2, minlength=flat.size) / np.maximum(flat, 1.0)
@@ -87,6 +87,12 @@ def robust_cells(points: Array, key: Index, grid: Grid) -> Cells:
         dropped_ratio=1.0 - float(flat[full].sum()) / total if total else 0.0,
         of_point=of_point,
     )
+
+
+def _upright(scale: Array, n: Array, grid: Grid) -> Mask:
+    """Cells whose returns spread in height as no surface's do: the rim of something upright. They are not believed."""
+    usual = float(np.median(scale[n >= MIN_POINTS])) if (n >= MIN_POINTS).any() else 0.0
+    return np.asarray(scale > max(0.25, 0.5 * grid.cell_m, 5.0 * usual))
 
 
 def _hanging(z: Array, grid: Grid) -> Mask:
@@ -172,7 +178,7 @@ def build_surface(grid: Grid, cells: Cells, inside: Mask, strip: Mask, reach_m: 
     any seen one are filled all the same, and called unseen.
     """
     seen = cells.seen & ~strip
-    planes = local_planes(grid, cells.x, cells.y, cells.z, np.where(seen, 1.0, 0.0), radius_cells=cells_of(0.75, grid))
+    planes = local_planes(grid, cells.x, cells.y, cells.z, np.where(seen, 1.0, 0.0), radius_cells=cells_of(0.5, grid))
     z = np.full(grid.shape, np.nan)
     gap = np.full(grid.shape, np.inf)
     if seen.any():

@@ -205,3 +205,18 @@ def test_no_map_makes_it_raise(points: np.ndarray) -> None:
     report = estimate_volume(cloud(points), CFG)
     assert report.warnings
     assert not np.isfinite(report.volume_m3) or report.interval_m3[1] > report.interval_m3[0]
+
+
+def test_box_on_the_floor_is_not_material() -> None:
+    hall = Hall(footprint=rectangle(), pile=ridge(25, 15, 6, 6.0, 0.7), boxes=((42.0, 3.0, 44.0, 5.0, 1.4),))
+    synthetic = make_map(hall, QUICK, 9)
+    report, error = measured(synthetic)
+    assert abs(error) < 0.4  # the box alone is 0.5 %
+    assert any("upright sides" in w for w in report.warnings)
+
+
+def test_steep_cone_is_material_all_the_same() -> None:
+    hall = Hall(footprint=rectangle(), pile=cone(25, 15, 2.5, 0.95))
+    report, error = measured(make_map(hall, QUICK, 10))
+    assert abs(error) < 2.0
+    assert not any("upright sides" in w for w in report.warnings)
