@@ -22,6 +22,7 @@ from companion.messages import (
     LidarScan,
     OdometryEstimate,
     OperatorCommand,
+    OperatorCommandKind,
     RangefinderSample,
     SetpointKind,
     Severity,
@@ -131,6 +132,8 @@ class Flight:
     def on_operator(self, command: OperatorCommand) -> None:
         self.record("operator", command.t_ns, f"{command.kind.value} {command.source}".encode(), None)
         self._commands.append(command)
+        if command.kind is OperatorCommandKind.RESUME:
+            self.session.resume_control()
         self.tap(topics.OPERATOR, command.t_ns, command)
 
     def begin_scan(self, scan: LidarScan, t_ns: int) -> Callable[[], ScanResult | None]:
