@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 SIMULATOR_PORT = 4560
 MAG_NOISE_GAUSS = 0.0005  # without noise PX4 takes the sensor for stale (VEHICLE measurements)
 RECEIVE_BYTES = 65536
+BOOT_NS = 1_000_000_000  # what a clock begins at: PX4 reads 0 as not set
 
 
 class Running(Protocol):
@@ -58,6 +59,7 @@ class Px4Sitl:
         self._link = HilLink()
         self._newest: ActuatorControls | None = None
         self._lost_s: float | None = None  # wall time when PX4 went away
+        self._clock_ahead_ns: int | None = None  # simulated time minus PX4's: after a restart its clock begins anew
         self.connections = 0
         try:
             self._listener = socket.create_server((host, port), backlog=1)
@@ -90,9 +92,12 @@ class Px4Sitl:
         mag = None
         if self._truth is not None:
             mag = magnetic_field_frd_gauss(self._truth(), self._noise.normal(0.0, MAG_NOISE_GAUSS, 3))
+        if self._clock_ahead_ns is None:
+            self._clock_ahead_ns = t_ns - BOOT_NS if self.connections > 1 else 0
+        t_px4_ns = t_ns - self._clock_ahead_ns
         try:
-            self._send(self._link.sensor_frames(t_ns, imu, baro, rangefinder_m, mag))
-            self._wait_for_answer(t_ns // 1000)
+            self._send(self._link.sensor_frames(t_px4_ns, imu, baro, rangefinder_m, mag))
+            self._wait_for_answer(t_px4_ns // 1000)
         except OSError:
             self._disconnect()
         return np.zeros(MOTORS) if self._newest is None else self._newest.motors
@@ -115,7 +120,7 @@ class Px4Sitl:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setblocking(False)
         self._connection, self._lost_s = connection, None
-        self._link, self._newest = HilLink(), None
+        self._link, self._newest, self._clock_ahead_ns = HilLink(), None, None
         self.connections += 1
         return True
 

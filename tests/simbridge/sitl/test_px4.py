@@ -108,16 +108,19 @@ def test_px4_gone_means_motors_off_and_back_means_lockstep_again(sitl: Px4Sitl) 
     RecordedPx4(sitl.port, leaves_after_us=13_000_000).start()  # armed, motors turning
     i = 0
     while i < 3100 and sitl.connections < 2 and (i < 200 or sitl.is_lockstep):
-        motors = step(sitl, i)
+        step(sitl, i)
         i += 1
     assert i * STEP_NS + FIRST_NS > 12_900_000_000
     assert not step(sitl, i).any()
-    RecordedPx4(sitl.port).start()
+    again = RecordedPx4(sitl.port)
+    again.start()
     while not sitl.is_lockstep:
         i += 1
-        motors = step(sitl, i)
+        step(sitl, i)
     assert sitl.connections == 2
-    assert motors.min() > 0.0
+    times = [m.time_usec for m in again.heard if m.get_type() == "HIL_SENSOR"]
+    assert times[0] == 1_000_000  # a PX4 that has restarted is given a clock that has, too
+    assert times[1] == 1_004_000
 
 
 def test_no_px4_is_told_with_what_to_do() -> None:
