@@ -94,7 +94,8 @@ def step_cost(links: tuple[str, ...], lowered: bool) -> float:
 
 PX4 = {
     "hold, horizontal RMS, cm": "1.1", "hold, drift in 10 s, cm": "3.2", "climb overshoot, cm": "none",
-    "forward overshoot, %": "6.0", "forward 90 % rise, s": "1.1", "stop distance, m": "0.27", "turn of 90 deg, peak": "93.2 to 93.5",
+    "forward overshoot, %": "6.0", "forward 90 % rise, s": "1.1", "stop distance, m": "0.27",
+    "turn of 90 deg, peak": "93.2 to 93.5",
     "turn of 90 deg, settled": "90.6 to 91.0", "landing from 4 m to disarmed, s": "9.3", "peak descent, m/s": "0.75",
 }  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -208,3 +209,25 @@ def test_setpoints_for_another_system_are_ignored() -> None:
     message = dialect.MAVLink_set_position_target_local_ned_message(1, 42, 1, 1, 0x9C7, *[0.0] * 11)
     rig.send(message)
     assert not rig.autopilot.commander.signal.ever
+
+
+def test_a_lost_ground_station_acts_only_where_it_is_asked_to() -> None:
+    for action, expected in ((0, "OFFBOARD"), (3, "LAND")):
+        rig = hovering({"COM_DL_LOSS_T": 2, "COM_FAIL_ACT_T": 0.5})
+        rig.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+        rig.send(
+            dialect.MAVLink_param_set_message(
+                1, 1, b"NAV_DLL_ACT", struct.unpack("<f", struct.pack("<i", action))[0], 6
+            )
+        )
+        rig.fly(3.5)
+        assert rig.autopilot.commander.mode.name == expected
+
+
+def test_a_companion_alone_hears_of_its_failsafe_by_event() -> None:
+    rig = hovering()
+    rig.stream(None)
+    rig.fly(1.5)
+    events = [struct.unpack_from("<I", f[10:])[0] for _, f in rig.frames if f[7:10] == (410).to_bytes(3, "little")]
+    assert 28241790 in events  # "No offboard signal"
+    assert events[-1] == 31382480  # "Failsafe activated", both recorded
