@@ -1,0 +1,100 @@
+"""World and companion as two programs in real time: they meet only on the wire, and SIGTERM lands the vehicle."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.flights import SMALL_HALL
+
+UNTIL_CLIMB_S = 200  # 50 s of time sync, and whatever a busy machine adds
+UNTIL_LANDED_S = 120
+
+pytestmark = pytest.mark.xdist_group("real time")
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def stockpilot(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "stockpilot.cli", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.timeout(400)
+def test_two_programs_fly_and_sigterm_lands_with_everything_recorded(tmp_path: Path) -> None:
+    mission = tmp_path / "small_hall.yaml"
+    mission.write_text(yaml.safe_dump(SMALL_HALL), encoding="utf-8")
+    mavlink, lidar, ground, out = free_port(), free_port(), free_port(), tmp_path / "flight"
+    world = stockpilot(
+        "sim", str(mission), "--offboard", f"udpout://127.0.0.1:{mavlink}", "--lidar", f"udp://127.0.0.1:{lidar}",
+        "--ground", f"udpout://127.0.0.1:{ground}", "--metadata", str(tmp_path / "lidar.json"), "--json",
+    )  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "lidar.json").exists() and time.monotonic() < deadline and world.poll() is None:
+            time.sleep(0.1)
+        companion = stockpilot(
+            "fly", str(mission), "--connect", f"udpin://127.0.0.1:{mavlink}", "--lidar", f"udp://127.0.0.1:{lidar}",
+            "--lidar-metadata", str(tmp_path / "lidar.json"), "--out", str(out), "--json",
+        )  # fmt: skip
+        try:
+            said = Listener(companion)
+            assert said.hears("climb", UNTIL_CLIMB_S), said.text()
+            time.sleep(3.0)
+            companion.send_signal(signal.SIGTERM)
+            assert companion.stdout is not None
+            printed = companion.stdout.read()
+            assert companion.wait(UNTIL_LANDED_S) == 1, said.text()
+        finally:
+            companion.kill()
+            companion.wait()
+    finally:
+        world.send_signal(signal.SIGTERM)
+        world_said, world_errors = world.communicate(timeout=60)
+    report = json.loads(printed)
+    assert report["state"] == "aborted", said.text()
+    assert report["scans"] > 100
+    assert json.loads(world_said)["collision"] is False, world_errors
+    for name in ("recording.mcap", "telemetry.tlog", "report.json", "map.ply"):
+        assert (out / name).stat().st_size > 0, name
+
+
+class Listener:
+    """Reads a program's stderr as it comes."""
+
+    def __init__(self, program: subprocess.Popen[str]) -> None:
+        self._program = program
+        self._lines: list[str] = []
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def hears(self, word: str, within_s: float) -> bool:
+        deadline = time.monotonic() + within_s
+        while time.monotonic() < deadline:
+            if any(word in line for line in self._lines):
+                return True
+            if self._program.poll() is not None:
+                return False
+            time.sleep(0.1)
+        return False
+
+    def text(self) -> str:
+        return "".join(self._lines)
+
+    def _read(self) -> None:
+        assert self._program.stderr is not None
+        for line in self._program.stderr:
+            self._lines.append(line)
