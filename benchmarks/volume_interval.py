@@ -62,8 +62,9 @@ def random_hall(kind: str, rng: np.random.Generator) -> Hall:
     return Hall(footprint=circle(radius), pile=cone(off, 0.0, min(height, 6.0), slope), **common)
 
 
-def random_flight(rng: np.random.Generator, *, hard: bool) -> Flight:
+def random_flight(rng: np.random.Generator, *, hard: bool, scan_period_s: float) -> Flight:
     return Flight(
+        scan_period_s=scan_period_s,
         noise_m=float(rng.choice([0.03, 0.12, 0.12, 0.12, 0.3])),
         position_sigma_m=float(rng.uniform(0.005, 0.03)),
         height_sigma_m=float(rng.uniform(0.002, 0.015)),
@@ -74,12 +75,12 @@ def random_flight(rng: np.random.Generator, *, hard: bool) -> Flight:
     )
 
 
-def run(index: int) -> dict[str, object]:
+def run(index: int, scan_period_s: float = 0.5) -> dict[str, object]:
     """One map by its number: the same number gives the same map."""
     rng = np.random.default_rng([7, index])
     kind = KINDS[index % len(KINDS)]
     hall = random_hall(kind, rng)
-    flight = random_flight(rng, hard=rng.random() < 0.3)
+    flight = random_flight(rng, hard=rng.random() < 0.3, scan_period_s=scan_period_s)
     synthetic = make_map(hall, flight, index)
     begin = time.perf_counter()
     report = estimate_volume(synthetic.point_map, VolumeConfig())
@@ -110,11 +111,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--maps", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--scan-period", type=float, default=0.5, help="seconds between mapped scans")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     rows = []
     for index in range(args.first, args.first + args.maps):
-        row = run(index)
+        row = run(index, args.scan_period)
         rows.append(row)
         print(
             f"{index:4d} {row['kind']:9s} noise {row['noise_m']:.2f} pos {row['position_sigma_m']:.3f} "

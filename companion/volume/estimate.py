@@ -75,7 +75,6 @@ def _report(
     footprint = replace(
         footprint,
         share=np.where(objects.cells, 0.0, footprint.share),
-        obstacle_area_m2=footprint.obstacle_area_m2 + float(objects.cells.sum()) * grid.cell_area_m2,
         warnings=(*footprint.warnings, *objects.warnings),
     )
     pile = pile_mask(height, footprint.share > 0, cells, grid)
@@ -95,7 +94,6 @@ def _report(
         position_sigma_m=position_sigma,
         height_sigma_m=max(point_map.height_sigma_m, keyframe_height_sigma(point_map, cells, floor)),
         wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, 0.005)) if footprint.has_walls else 0.0,
-        obstacle_area_m2=footprint.obstacle_area_m2,
     )
     total = float(area.sum())
     ratio = {s: float(area[surface.state == s].sum()) / total for s in CellState}

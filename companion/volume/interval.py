@@ -38,7 +38,6 @@ class Evidence:
     position_sigma_m: float
     height_sigma_m: float
     wall_sigma_m: float
-    obstacle_area_m2: float
 
 
 def error_budget(e: Evidence) -> dict[str, float]:

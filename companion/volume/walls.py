@@ -13,8 +13,9 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from companion.messages import Array, PointMap
+from companion.volume.edges import fit_edges, pose_disagreement
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc
-from companion.volume.polygon import contains, coverage, edge_distance, outline, resample, signed_area, simplify_closed
+from companion.volume.polygon import contains, coverage, edge_distance, outline, resample
 
 SLAB_HALF_M = 0.75  # about the flight height: every ray of the horizontal layer ends on something upright
 UPRIGHT_SPREAD_M = 1.2  # height spread over one cell that no slope of loose material reaches
@@ -40,7 +41,6 @@ class Footprint:
     share: Array
     depth_m: Array
     blocked: Mask
-    obstacle_area_m2: float
     noise_m: float
     fit_sigma_m: float
     pose_sigma_m: float
@@ -172,7 +172,6 @@ def _open_footprint(grid: Grid, key: Index, ceiling: float) -> Footprint:
         share=region.astype(np.float64),
         depth_m=np.where(region, depth, -grid.cell_m),
         blocked=np.zeros(grid.shape, dtype=np.bool_),
-        obstacle_area_m2=0.0,
         noise_m=0.0,
         fit_sigma_m=0.0,
         pose_sigma_m=0.0,
@@ -190,7 +189,7 @@ def _closed_footprint(
     points = point_map.points_map[wall, :2]
     rough = resample(outline(region, grid), 0.4)
     fine, spread = _pull_to_wall(rough, points)
-    polygon, fits = _fit_edges(fine, points, spread)
+    polygon, fits = fit_edges(fine, points, spread)
     noise = float(np.median([f.noise_m for f in fits])) if fits else spread
     cx, cy = grid.centres()
     inside = contains(polygon, cx, cy)
@@ -201,10 +200,9 @@ def _closed_footprint(
         share=coverage(polygon, grid),
         depth_m=depth,
         blocked=np.zeros(grid.shape, dtype=np.bool_),
-        obstacle_area_m2=0.0,
         noise_m=noise,
         fit_sigma_m=float(np.median([f.waviness_m for f in fits])) if fits else grid.cell_m,
-        pose_sigma_m=_pose_disagreement(fits, points, point_map.keyframe_id[wall]),
+        pose_sigma_m=pose_disagreement(fits, points, point_map.keyframe_id[wall]),
         ceiling_m=ceiling,
         beyond_ratio=0.0,
         warnings=(),
@@ -241,142 +239,6 @@ def _pull_to_wall(loop: Array, points: Array) -> tuple[Array, float]:
     return fine, float(np.median(spreads)) if spreads else 0.1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _EdgeFit:
-    """One straight stretch: a point on it, its direction, and how its returns lie about it."""
-
-    point: Array
-    direction: Array
-    noise_m: float
-    waviness_m: float
-    members: Index
-    offsets_m: Array
-
-
-def _fit_edges(loop: Array, points: Array, spread: float) -> tuple[Array, list[_EdgeFit]]:
-    """Straight stretches by Douglas and Peucker, each fitted to its returns, joined at their intersections."""
-    corners = loop[simplify_closed(loop, max(0.12, 0.7 * spread))]
-    if signed_area(corners) < 0:
-        corners = corners[::-1]
-    ends = np.roll(corners, -1, axis=0)
-    lines = [_fit_edge(a, b, points, spread) for a, b in zip(corners, ends, strict=True)]
-    corners, lines = _without_chamfers(corners, ends, lines)
-    vertices: list[Array] = []
-    for i, corner in enumerate(corners):
-        vertices += _join(lines[i - 1], lines[i], corner)
-    return np.array(vertices), [line for line in lines if line is not None]
-
-
-def _without_chamfers(corners: Array, ends: Array, lines: list[_EdgeFit | None]) -> tuple[Array, list[_EdgeFit | None]]:
-    """Leave out the short cuts that smoothing draws across corners: where the walls on both sides meet just beyond."""
-    count = len(lines)
-    length = np.hypot(*(ends - corners).T)
-    is_cut = length < 1.0
-    if count < 4 or is_cut.all():
-        return corners, lines
-    start = int(np.flatnonzero(~is_cut)[0])
-    kept: list[tuple[Array, _EdgeFit | None]] = []
-    run: list[int] = []
-    for k in [(start + n) % count for n in range(1, count + 1)]:
-        if is_cut[k]:
-            run.append(k)
-            continue
-        corner = corners[k]
-        if run:
-            middle = 0.5 * (corners[run[0]] + ends[run[-1]])
-            before, after = lines[run[0] - 1], lines[k]
-            is_corner = before is not None and after is not None and len(_join(before, after, middle)) == 1
-            if is_corner and float(length[run].sum()) < 1.6:
-                corner = middle
-            else:
-                kept += [(corners[r], lines[r]) for r in run]
-        kept.append((corner, lines[k]))
-        run = []
-    return np.array([c for c, _ in kept]), [line for _, line in kept]
-
-
-def _fit_edge(a: Array, b: Array, points: Array, spread: float) -> _EdgeFit | None:
-    length = float(np.hypot(*(b - a)))
-    if length < 0.8:
-        return None
-    direction = (b - a) / length
-    trim = min(0.4, 0.2 * length)
-    d = points - a
-    along = d @ direction
-    across = d @ np.array([direction[1], -direction[0]])
-    near = np.flatnonzero((along > trim) & (along < length - trim) & (np.abs(across) < 6 * spread + 0.1))
-    if len(near) < 30:
-        return None
-    s, e = along[near] - 0.5 * length, across[near]
-    offset, slope, sigma = 0.0, 0.0, 2 * spread + 0.05
-    for _ in range(5):
-        r = e - offset - slope * s
-        ok = np.abs(r) < 3.5 * sigma
-        if ok.sum() < 20:
-            return None
-        slope, offset = (float(v) for v in np.polyfit(s[ok], e[ok], 1))
-        sigma = max(1.4826 * float(np.median(np.abs(e[ok] - offset - slope * s[ok]))), 0.005)
-    r = e - offset - slope * s
-    ok = np.abs(r) < 3.5 * sigma
-    normal = np.array([direction[1], -direction[0]])
-    turned = direction + slope * normal
-    return _EdgeFit(
-        point=a + 0.5 * length * direction + offset * normal,
-        direction=turned / np.hypot(*turned),
-        noise_m=sigma,
-        waviness_m=_waviness(s[ok], r[ok], length),
-        members=near[ok],
-        offsets_m=r[ok],
-    )
-
-
-def _waviness(s: Array, r: Array, length: float) -> float:
-    """1 sigma of the wall's own place along the stretch: means over about 1 m, less what noise explains."""
-    bins = max(2, int(length))
-    index = np.clip(((s / length + 0.5) * bins).astype(np.int64), 0, bins - 1)
-    n = np.bincount(index, minlength=bins)
-    full = n >= 5
-    if full.sum() < 2:
-        return 0.0
-    means = np.bincount(index, r, minlength=bins)[full] / n[full]
-    explained = float(np.mean(np.var(r) / n[full]))
-    return float(np.sqrt(max(float(np.mean(means**2)) - explained, 0.0)))
-
-
-def _join(before: _EdgeFit | None, after: _EdgeFit | None, corner: Array) -> list[Array]:
-    """The vertex (or two) where two stretches meet: their intersection where it is well placed."""
-    if before is None and after is None:
-        return [corner]
-    if before is None or after is None:
-        line = before or after
-        assert line is not None
-        return [line.point + ((corner - line.point) @ line.direction) * line.direction]
-    cross = before.direction[0] * after.direction[1] - before.direction[1] * after.direction[0]
-    if abs(cross) > 0.1:
-        gap = after.point - before.point
-        t = (gap[0] * after.direction[1] - gap[1] * after.direction[0]) / cross
-        meeting = before.point + t * before.direction
-        if np.hypot(*(meeting - corner)) < 1.0:
-            return [meeting]
-    return [line.point + ((corner - line.point) @ line.direction) * line.direction for line in (before, after)]
-
-
-def _pose_disagreement(fits: list[_EdgeFit], points: Array, keyframe: Index) -> float:
-    """How far the keyframes disagree on where a wall is, 1 sigma: their own mean offsets, less what noise explains."""
-    total, weight = 0.0, 0.0
-    for fit in fits:
-        ids, index = np.unique(keyframe[fit.members], return_inverse=True)
-        n = np.bincount(index)
-        seen = n >= 8
-        if len(ids) < 3 or seen.sum() < 3:
-            continue
-        means = np.bincount(index, fit.offsets_m)[seen] / n[seen]
-        spread = float(np.median(np.abs(means - np.median(means))) * 1.4826) ** 2
-        total += float(seen.sum()) * max(spread - float(np.mean(fit.noise_m**2 / n[seen])), 0.0)
-        weight += float(seen.sum())
-    return float(np.sqrt(total / weight)) if weight else 0.0
-
-
 def _cut_obstacles(footprint: Footprint, points: Array, grid: Grid, key: Index, structure: Mask) -> Footprint:
     """Columns and the like: upright things inside the walls. Their returns go, and the floor that they cover."""
     free_of_wall = footprint.depth_m > footprint.margin_m + grid.cell_m
@@ -384,7 +246,7 @@ def _cut_obstacles(footprint: Footprint, points: Array, grid: Grid, key: Index, 
     if n == 0:
         return footprint
     blocked = np.zeros(grid.shape, dtype=np.bool_)
-    share, area, warnings = footprint.share.copy(), 0.0, list(footprint.warnings)
+    share, warnings = footprint.share.copy(), list(footprint.warnings)
     at = label.ravel()[np.maximum(key, 0)] * (key >= 0)
     for i in range(1, n + 1):
         z = points[at == i, 2]
@@ -402,6 +264,5 @@ def _cut_obstacles(footprint: Footprint, points: Array, grid: Grid, key: Index, 
         radius = np.sqrt(cells_area / np.pi)
         true_radius = max(radius - 1.2 * footprint.noise_m - 0.3 * grid.cell_m, 0.3 * radius)
         share[body] *= 1.0 - (true_radius / radius) ** 2
-        area += float(np.pi * true_radius**2)
         blocked |= ndimage.binary_dilation(body, disc(cells_of(footprint.margin_m, grid)))
-    return replace(footprint, share=share, blocked=blocked, obstacle_area_m2=area, warnings=tuple(warnings))
+    return replace(footprint, share=share, blocked=blocked, warnings=tuple(warnings))
