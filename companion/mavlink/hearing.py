@@ -24,6 +24,8 @@ from companion.messages import AttitudeSample, LandedState, RangefinderSample, S
 _DIALECTS = {wire.AUTOPILOT_PX4: PX4, wire.AUTOPILOT_ARDUPILOT: ARDUPILOT}
 _DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _PREARM = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
+_MAV_STATE_BOOT = 1
+_ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 _MAX_RATE_RADPS = 100.0
 _FIRST_BATTERY = 0
 
@@ -92,6 +94,10 @@ class Hearing:
         is_first = self.vehicle.t_heartbeat_ns is None
         if dialect is not self.dialect:
             self._begin(dialect, t_ns)
+        elif system_status == _MAV_STATE_BOOT and self.vehicle.system_status > _MAV_STATE_BOOT:
+            self._begin_anew("it says that it boots", None, t_ns)  # ArduPilot: nothing with its clock streams then
+        elif self._was_lost(t_ns) and not self.vehicle.is_armed and not base_mode & _ARMED:
+            self._begin(dialect, t_ns)  # it may have restarted: streams, origin and parameters are asked for again
         self._journal.add(self.vehicle.on_heartbeat(dialect, custom_mode, base_mode, system_status, t_ns))
         if is_first and self.vehicle.is_armed:
             self.vehicle.joined_in_flight = True
@@ -128,16 +134,22 @@ class Hearing:
             self._journal.tell(Severity.WARNING, "stream_refused", f"Stream {outcome.label}: {outcome.word}")
 
     def _note_boot_time(self, boot_ms: int, t_ns: int) -> None:
-        if not self.vehicle.on_boot_time(boot_ms) or self.dialect is None:
+        if self.vehicle.on_boot_time(boot_ms):
+            self._begin_anew(f"its clock fell to {boot_ms / 1e3:.1f} s", boot_ms, t_ns)
+
+    def _begin_anew(self, why: str, boot_ms: int | None, t_ns: int) -> None:
+        if self.dialect is None:
             return
         self.vehicle = Vehicle(t_heard_ns=t_ns, boot_ms=boot_ms)
         self._begin(self.dialect, t_ns)
         self._journal.tell(
             Severity.CRITICAL,
             "autopilot_rebooted",
-            f"The autopilot has restarted (its clock fell to {boot_ms / 1e3:.1f} s): offboard dropped, the handshake "
-            "begins anew, nothing is armed",
+            f"The autopilot has restarted ({why}): offboard dropped, the handshake begins anew, nothing is armed",
         )
+
+    def _was_lost(self, t_ns: int) -> bool:
+        return self.vehicle.t_heartbeat_ns is not None and not self.vehicle.is_connected(t_ns)
 
     # ---- samples ----------------------------------------------------------------------------------------------------
 

@@ -532,6 +532,38 @@ def test_a_restart_of_the_autopilot_redoes_the_handshake_and_never_arms() -> Non
     assert not state(peer).is_armed
 
 
+def test_an_ardupilot_that_boots_again_is_noticed_though_nothing_with_its_clock_streams() -> None:
+    """As seen with real ArduCopter: after its restart only heartbeats come, the first with MAV_STATE_BOOT."""
+    peer = Peer(autopilot=3)
+    peer.make_ready()
+    peer.sent.clear()
+    peer.say(p.heartbeat(3, custom_mode=0, status=1))
+    peer.run(2.0)
+    assert "autopilot_rebooted" in peer.event_names()
+    assert 511 in {c.command for c in peer.of("COMMAND_LONG")}  # streams are asked for again
+    assert not state(peer).is_ready_to_arm
+
+
+def test_an_autopilot_that_was_gone_is_asked_for_all_again() -> None:
+    peer = Peer(autopilot=3)
+    peer.make_ready()
+    peer.silent = True
+    peer.run(4.0)
+    peer.sent.clear()
+    peer.silent = False
+    peer.run(2.0)
+    assert 511 in {c.command for c in peer.of("COMMAND_LONG")}
+    assert "autopilot_rebooted" not in peer.event_names()  # that is not known
+
+
+def test_one_that_boots_for_the_first_time_has_not_rebooted() -> None:
+    peer = Peer(autopilot=3)
+    peer.say(p.heartbeat(3, custom_mode=0, status=0))
+    peer.say(p.heartbeat(3, custom_mode=0, status=1))
+    peer.say(p.heartbeat(3, custom_mode=0, status=3))
+    assert "autopilot_rebooted" not in peer.event_names()
+
+
 def test_a_clock_that_wraps_or_a_late_packet_is_no_restart() -> None:
     peer = Peer()
     peer.say(p.heartbeat())
