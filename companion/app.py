@@ -20,13 +20,14 @@ import numpy as np
 from companion.flight import Flight
 from companion.lidar.udp import LidarSocket, open_lidar
 from companion.mavlink.link import MavlinkLink, open_link
-from companion.messages import LidarScan, OperatorCommand, OperatorCommandKind
+from companion.messages import Event, LidarScan, OperatorCommand, OperatorCommandKind, Severity
 from companion.odometry import ScanResult
 
 SWITCH_INTERVAL_S = 0.001  # how long a thread may keep the interpreter from the beat
 SCAN_QUEUE = 2  # topics.SCAN.queue: a late scan is worth less than the next one
 MAP_QUEUE = 64
 AFTER_FINISH_S = 1.0
+LAG_LIMIT_NS, LAG_TOLD_NS = 100_000_000, 10_000_000_000
 ODOMETRY, SETPOINT = 331, 84  # message ids of MAVLink common
 
 
@@ -43,6 +44,8 @@ class App:
     scans_dropped: int = 0
     scans_unmapped: int = 0
     restarts: dict[str, int] = field(default_factory=dict)
+    longest_lag_s: float = 0.0
+    _told_lag_ns: int = -(1 << 62)
     _sent_ns: dict[int, list[int]] = field(default_factory=lambda: {ODOMETRY: [], SETPOINT: []})
     _scans: deque[LidarScan] = field(default_factory=lambda: deque(maxlen=SCAN_QUEUE))
     _scan_ready: asyncio.Event = field(default_factory=asyncio.Event)
@@ -103,15 +106,22 @@ class App:
         """Estimates, setpoints, heartbeats at their deadlines, until the flight is finished."""
         finished_ns: int | None = None
         while finished_ns is None or time.monotonic_ns() - finished_ns < AFTER_FINISH_S * 1e9:
-            wait_ns = self.flight.next_deadline_ns() - time.monotonic_ns()
-            if wait_ns > 0:
-                await asyncio.sleep(wait_ns * 1e-9)
-            else:
-                await asyncio.sleep(0)
-            self.flight.poll(time.monotonic_ns())
+            deadline_ns = self.flight.next_deadline_ns()
+            await asyncio.sleep(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9))
+            now_ns = time.monotonic_ns()
+            self._note_lag(now_ns, now_ns - deadline_ns)
+            self.flight.poll(now_ns)
             self._send()
             if self.flight.is_finished and finished_ns is None:
                 finished_ns = time.monotonic_ns()
+
+    def _note_lag(self, t_ns: int, lag_ns: int) -> None:
+        """A beat that comes late means that this computer is overloaded: say so, not at every beat."""
+        self.longest_lag_s = max(self.longest_lag_s, lag_ns * 1e-9)
+        if lag_ns > LAG_LIMIT_NS and t_ns - self._told_lag_ns > LAG_TOLD_NS:
+            self._told_lag_ns = t_ns
+            text = f"Overloaded: a beat came {lag_ns * 1e-6:.0f} ms late"
+            self.flight.tell(Event(t_ns=t_ns, severity=Severity.WARNING, name="overloaded", text=text))
 
     async def _receive_mavlink(self, link: MavlinkLink) -> None:
         while True:

@@ -35,6 +35,16 @@ def test_flight_code_has_no_test_mode_and_reads_no_environment(path: Path) -> No
     assert "getenv" not in attributes
 
 
+WALL_CLOCK_LABELS = {"companion/telemetry/mqtt.py", "companion/mavlink/keys.py"}  # age of commands, signing's epoch
+
+
+@pytest.mark.parametrize("path", FLIGHT_CODE, ids=lambda p: str(p.relative_to(ROOT)))
+def test_control_never_reads_the_wall_clock(path: Path) -> None:
+    """A clock that steps can then change nothing but labels (docs/safety.md, 10)."""
+    reads = re.search(r"time\.time(_ns)?\b|datetime\.", path.read_text(encoding="utf-8"))
+    assert reads is None or str(path.relative_to(ROOT)) in WALL_CLOCK_LABELS
+
+
 def test_dataflow_table_is_generated_from_the_topics() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     assert with_table(text) == text, "docs/dataflow.md is stale: run `make docs`"
