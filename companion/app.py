@@ -15,20 +15,17 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
-import numpy as np
-
+from companion.cadence import Cadence
 from companion.flight import Flight
 from companion.lidar.udp import LidarSocket, open_lidar
 from companion.mavlink.link import MavlinkLink, open_link
-from companion.messages import Event, LidarScan, OperatorCommand, OperatorCommandKind, Severity
+from companion.messages import LidarScan, OperatorCommand, OperatorCommandKind
 from companion.odometry import ScanResult
 
 SWITCH_INTERVAL_S = 0.001  # how long a thread may keep the interpreter from the beat
 SCAN_QUEUE = 2  # topics.SCAN.queue: a late scan is worth less than the next one
 MAP_QUEUE = 64
 AFTER_FINISH_S = 1.0
-LAG_LIMIT_NS, LAG_TOLD_NS = 100_000_000, 10_000_000_000
-ODOMETRY, SETPOINT = 331, 84  # message ids of MAVLink common
 
 
 @dataclass(slots=True)
@@ -44,9 +41,7 @@ class App:
     scans_dropped: int = 0
     scans_unmapped: int = 0
     restarts: dict[str, int] = field(default_factory=dict)
-    longest_lag_s: float = 0.0
-    _told_lag_ns: int = -(1 << 62)
-    _sent_ns: dict[int, list[int]] = field(default_factory=lambda: {ODOMETRY: [], SETPOINT: []})
+    cadence: Cadence = field(default_factory=Cadence)
     _scans: deque[LidarScan] = field(default_factory=lambda: deque(maxlen=SCAN_QUEUE))
     _scan_ready: asyncio.Event = field(default_factory=asyncio.Event)
     _to_map: deque[ScanResult] = field(default_factory=lambda: deque(maxlen=MAP_QUEUE))
@@ -109,19 +104,13 @@ class App:
             deadline_ns = self.flight.next_deadline_ns()
             await asyncio.sleep(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9))
             now_ns = time.monotonic_ns()
-            self._note_lag(now_ns, now_ns - deadline_ns)
+            overloaded = self.cadence.lag(now_ns, now_ns - deadline_ns)
+            if overloaded is not None:
+                self.flight.tell(overloaded)
             self.flight.poll(now_ns)
             self._send()
             if self.flight.is_finished and finished_ns is None:
                 finished_ns = time.monotonic_ns()
-
-    def _note_lag(self, t_ns: int, lag_ns: int) -> None:
-        """A beat that comes late means that this computer is overloaded: say so, not at every beat."""
-        self.longest_lag_s = max(self.longest_lag_s, lag_ns * 1e-9)
-        if lag_ns > LAG_LIMIT_NS and t_ns - self._told_lag_ns > LAG_TOLD_NS:
-            self._told_lag_ns = t_ns
-            text = f"Overloaded: a beat came {lag_ns * 1e-6:.0f} ms late"
-            self.flight.tell(Event(t_ns=t_ns, severity=Severity.WARNING, name="overloaded", text=text))
 
     async def _receive_mavlink(self, link: MavlinkLink) -> None:
         while True:
@@ -166,18 +155,6 @@ class App:
         for frame in self.flight.take_output():
             self._link.send(frame)
             now = time.monotonic_ns()
-            kept = self._sent_ns.get(int.from_bytes(frame[7:10], "little"))
-            if kept is not None:
-                kept.append(now)
+            self.cadence.sent(frame, now)
             if self.on_sent is not None:
                 self.on_sent(now, frame)
-
-    def cadence(self) -> dict[str, dict[str, float]]:
-        """Measured intervals of what the flight controller needs steadily: median, 99th percentile, longest, in s."""
-        out: dict[str, dict[str, float]] = {}
-        for name, msg_id in (("odometry", ODOMETRY), ("setpoint", SETPOINT)):
-            interval = np.diff(np.array(self._sent_ns[msg_id], dtype=np.int64)) * 1e-9
-            if len(interval):
-                median, high = np.percentile(interval, [50, 99])
-                out[name] = {"median_s": float(median), "p99_s": float(high), "max_s": float(interval.max())}
-        return out

@@ -96,7 +96,8 @@ def flight_report(mission: Mission, flight: Flight, app: App, wall_time_s: float
         "keyframes": len(flight.keyframes),
         "lap_closed": bool(navigation is not None and navigation.lap_closed),
         "odometry_max_gap_s": flight.odometry_max_gap_s,
-        "cadence": app.cadence(),
+        "cadence": app.cadence.report(),
+        "longest_lag_s": app.cadence.longest_lag_s,
         "lidar_dropped": dict(flight.decoder.dropped),
         "events": [
             {"t_s": (e.t_ns - flight.events[0].t_ns) * 1e-9, "severity": e.severity.name, "name": e.name, "text": e.text}

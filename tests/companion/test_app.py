@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from companion.app import App
+from companion.cadence import Cadence
 from companion.config import CompanionConfig
 from companion.flight import Flight
 from companion.messages import Event, LidarScan
@@ -83,14 +84,26 @@ async def test_a_registration_that_hangs_does_not_hold_up_the_beat(app: App, mon
     assert len(polled) > 5
 
 
-async def test_a_beat_that_comes_late_is_told_once_in_a_while(app: App) -> None:
-    heard = events_of(app)
-    now = time.monotonic_ns()
-    app._note_lag(now, 150_000_000)
-    app._note_lag(now + 1_000_000_000, 150_000_000)
-    app._note_lag(now + 11_000_000_000, 20_000_000)
-    assert [event.name for event in heard] == ["overloaded"]
-    assert app.longest_lag_s == pytest.approx(0.15)
+def test_a_beat_that_comes_late_is_told_once_in_a_while() -> None:
+    cadence = Cadence()
+    told = [
+        cadence.lag(0, 150_000_000),
+        cadence.lag(1_000_000_000, 150_000_000),
+        cadence.lag(11_000_000_000, 20_000_000),
+    ]
+    assert [event.name for event in told if event is not None] == ["overloaded"]
+    assert cadence.longest_lag_s == pytest.approx(0.15)
+
+
+def test_cadence_measures_what_the_flight_controller_needs() -> None:
+    cadence = Cadence()
+    odometry = b"\xfd" + bytes(6) + (331).to_bytes(3, "little")
+    for n in range(11):
+        cadence.sent(odometry, n * 32_000_000)
+    cadence.sent(b"\xfd" + bytes(9), 5)
+    report = cadence.report()
+    assert set(report) == {"odometry"}
+    assert report["odometry"]["median_s"] == pytest.approx(0.032)
 
 
 async def test_sigterm_reaches_the_flight_as_an_abort(app: App) -> None:
