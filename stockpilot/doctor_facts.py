@@ -24,12 +24,8 @@ from stockpilot.vehicle_link import VehicleLink
 _DIALECTS: dict[str, Dialect] = {"px4": PX4, "ardupilot": ARDUPILOT}
 _ARMED = 128
 _ON_GROUND = 1
-_STREAMS_HZ = {
-    30: 10.0,
-    31: 10.0,
-    32: 5.0,
-    245: 2.0,
-}  # ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, EXTENDED_SYS_STATE
+# SYS_STATUS, ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, DISTANCE_SENSOR, EXTENDED_SYS_STATE
+_STREAMS_HZ = {1: 2.0, 30: 10.0, 31: 10.0, 32: 5.0, 132: 2.0, 245: 2.0}
 _SETTLE_S = 1.2
 
 
@@ -69,18 +65,19 @@ async def gather(link: VehicleLink, around: Surroundings, *, probe: Probe | None
     packets_hz, sources = await lidar_task
     origin = link.newest.get("GPS_GLOBAL_ORIGIN")
     status = link.newest.get("SYS_STATUS", {})
+    remaining = status.get("battery_remaining")
     return Facts(
         autopilot=link.autopilot,
         version=link.version or await _version(link),
         is_armed=_is_armed(link),
         parameters=parameters,
         rates_hz=rates,
-        timesync_questions_hz=rates.get("TIMESYNC"),
         timesync_round_trip_s=round_trip,
         has_origin=origin is not None,
         origin_altitude_m=float(origin["altitude"]) / 1e3 if origin else None,
         sensors_present=status.get("onboard_control_sensors_present"),
         sensors_health=status.get("onboard_control_sensors_health"),
+        battery_ratio=remaining / 100.0 if isinstance(remaining, int) and 0 <= remaining <= 100 else None,
         estimator_flags=flags,
         is_vision_fused=fused,
         ratios=ratios,

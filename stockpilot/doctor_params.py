@@ -33,10 +33,13 @@ async def read_parameters(link: VehicleLink) -> dict[str, float | None]:
     if manifest is None:
         return {}
     param = ParamAsync(link.system)
-    names = dict.fromkeys(name for e in manifest.parameters for name in (e.name, *e.other_names))
     values: dict[str, float | None] = {}
-    for name in names:
-        values[name] = await _read(param, name)
+    for expected in manifest.parameters:
+        for name in (expected.name, *expected.other_names):
+            if name not in values:
+                values[name] = await _read(param, name)
+            if values[name] is not None:
+                break  # an older name is asked for only where the new one is not there: silence costs seconds
     return values
 
 

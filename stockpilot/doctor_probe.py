@@ -46,7 +46,13 @@ async def ensure_origin(link: VehicleLink, *, may_set: bool) -> bool:
     for _ in range(_ORIGIN_TRIES if may_set else 0):
         await link.send(
             "SET_GPS_GLOBAL_ORIGIN",
-            {"target_system": 1, "latitude": latitude, "longitude": longitude, "altitude": 0, "time_usec": 0},
+            {
+                "target_system": link.system_id,
+                "latitude": latitude,
+                "longitude": longitude,
+                "altitude": 0,
+                "time_usec": 0,
+            },
         )
         if await link.wait_for("GPS_GLOBAL_ORIGIN", 1.0) is not None:
             return True

@@ -30,6 +30,7 @@ class VehicleLink:
     url: str
     system: Any
     direct: Any
+    system_id: int = 1
     autopilot: str | None = None
     newest: dict[str, Fields] = field(default_factory=dict)
     arrived_s: dict[str, float] = field(default_factory=dict)
@@ -79,7 +80,7 @@ class VehicleLink:
             message_name=name,
             system_id=GROUND_SYSTEM,
             component_id=GROUND_COMPONENT,
-            target_system_id=int(fields.get("target_system", 1)),
+            target_system_id=int(fields.get("target_system", self.system_id)),
             target_component_id=int(fields.get("target_component", AUTOPILOT)),
             fields_json=json.dumps({"message_name": name, **fields}),
         )
@@ -92,7 +93,7 @@ class VehicleLink:
         """COMMAND_LONG, without waiting for its answer."""
         fields: Fields = {f"param{i + 1}": 0.0 for i in range(7)}
         fields |= {f"param{i + 1}": value for i, value in enumerate(params)}
-        ids = {"target_system": await self.system.get_system_id(), "target_component": AUTOPILOT}
+        ids = {"target_system": self.system_id, "target_component": AUTOPILOT}
         await self.send("COMMAND_LONG", {**fields, **ids, "command": number, "confirmation": 0})
 
     async def wait_for_timesync(self, asked_ns: int, timeout_s: float) -> float | None:
@@ -137,7 +138,8 @@ async def open_vehicle(url: str, timeout_s: float = 10.0) -> AsyncIterator[Vehic
                 f"--connect {url}: no autopilot's heartbeat within {timeout_s:g} s: is it powered, does it send to "
                 "this address, is the port right (ground station: 14550)?"
             )
-        link = VehicleLink(url=url, system=system, direct=MavlinkDirectAsync(system))
+        system_id = await system.get_system_id()
+        link = VehicleLink(url=url, system=system, direct=MavlinkDirectAsync(system), system_id=system_id)
         listener = asyncio.create_task(link.listen())
         try:
             await link.wait_for("HEARTBEAT", 3.0)

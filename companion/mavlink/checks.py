@@ -32,7 +32,8 @@ class Check:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SentVision:
     """ODOMETRY as it left, over some seconds. max_gap_s: longest pause. norm_error: of the quaternion. position_sigma_m:
-    square root of the largest diagonal element of position; NaN: unset. stamp_gap_s: of time_usec, None: one sample."""
+    square root of the largest diagonal element of position; NaN: unset. stamps_forward: each time_usec later than the
+    one before."""
 
     rate_hz: float
     max_gap_s: float
@@ -55,12 +56,12 @@ class Facts:
     is_armed: bool = False
     parameters: Mapping[str, float | None] = field(default_factory=dict)
     rates_hz: Mapping[str, float] = field(default_factory=dict)
-    timesync_questions_hz: float | None = None
     timesync_round_trip_s: float | None = None
     has_origin: bool | None = None
     origin_altitude_m: float | None = None
     sensors_present: int | None = None
     sensors_health: int | None = None
+    battery_ratio: float | None = None
     estimator_flags: int | None = None
     is_vision_fused: bool | None = None
     ratios: Mapping[str, float] = field(default_factory=dict)
@@ -86,6 +87,7 @@ def all_checks(facts: Facts) -> list[Check]:
         *check_time(facts),
         *check_streams(facts),
         *check_sensors(facts),
+        *check_battery(facts),
         *check_origin(facts),
         *check_lidar(facts),
         *check_computer(facts),
@@ -239,6 +241,22 @@ def check_sensors(facts: Facts) -> list[Check]:
             )
         )
     return checks
+
+
+def check_battery(facts: Facts) -> list[Check]:
+    if facts.battery_ratio is None:
+        return []
+    share = facts.battery_ratio
+    verdict = Verdict.OK if share >= 0.5 else Verdict.WARN if share >= 0.25 else Verdict.FAIL
+    return [
+        Check(
+            name="sensor.battery",
+            verdict=verdict,
+            actual=f"{share:.0%}",
+            expected="at least 50 %, the way back and 30 % above it",
+            mend="" if verdict is Verdict.OK else "Charge it",
+        )
+    ]
 
 
 def check_origin(facts: Facts) -> list[Check]:

@@ -125,7 +125,9 @@ def test_px4_setpoint_loss_is_heard_as_failsafe_land() -> None:
     assert heard.first("autopilot_failsafe", "offboard to land") == pytest.approx(80.0, abs=0.1)
     assert heard.first("autopilot_event", "Failsafe activated") == pytest.approx(79.53, abs=0.1)
     assert not heard.at(79.5).is_failsafe
-    assert heard.at(79.6).is_failsafe, "the event says so before the heartbeat, and before CURRENT_MODE where that comes"
+    assert heard.at(79.6).is_failsafe, (
+        "the event says so before the heartbeat, and before CURRENT_MODE where that comes"
+    )
     assert heard.at(80.1).is_failsafe
     assert heard.at(82.0).mode is FlightMode.LAND
     assert not heard.at(90.9).is_failsafe

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as m
 
+import companion
+from companion.config import MavlinkConfig
 from companion.mavlink.px4 import PX4
+from companion.mavlink.session import MavlinkSession
 from companion.messages import (
     AttitudeSample,
     Event,
@@ -734,3 +738,36 @@ def test_state_is_landed_or_flying_as_extended_sys_state_says() -> None:
     for number, landed in ((1, LandedState.ON_GROUND), (2, LandedState.IN_AIR), (9, LandedState.UNDEFINED)):
         peer.say(m.MAVLink_extended_sys_state_message(0, number))
         assert state(peer).landed_state is landed
+
+
+# ---- the vehicle's own number, and what may not fly -----------------------------------------------------------------
+
+
+def test_a_vehicle_of_another_number_is_addressed_by_it() -> None:
+    """PX4.md 4: a companion's heartbeat counts only with the autopilot's own system id; setpoints and commands are
+    taken only by their target."""
+    session = MavlinkSession(MavlinkConfig(system_id=7))
+    hello = p.heartbeat().pack(p.packer(7, 1))
+    session.receive(bytes(hello), SECOND)
+    session.poll(SECOND)
+    session.send_setpoint(p.setpoint(SECOND))
+    sent = p.parse(session.data_to_send())
+    assert {message.get_srcSystem() for message in sent} == {7}
+    targets = {message.target_system for message in sent if hasattr(message, "target_system")}
+    assert targets == {7}
+    assert {message.get_type() for message in sent} >= {"HEARTBEAT", "COMMAND_LONG", "SET_POSITION_TARGET_LOCAL_NED"}
+
+
+def test_neither_mavutil_nor_mavsdk_is_part_of_the_flight_loop() -> None:
+    """AUTOPILOTS.md: mavutil blocks; MAVSDK repeats the last setpoint from a thread of its own, so that a hung program
+    never trips the autopilot's own failsafe."""
+    root = Path(companion.__file__).parent
+    files = [path for path in root.rglob("*.py") if "__pycache__" not in path.parts]
+    assert len(files) > 30
+    imports = [
+        (path.name, line)
+        for path in files
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if line.lstrip().startswith(("import ", "from ")) and ("mavutil" in line or "mavsdk" in line)
+    ]
+    assert imports == []
