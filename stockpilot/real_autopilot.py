@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from companion.errors import ConfigError, LinkError
 from simbridge.config import SimConfig
@@ -115,7 +116,9 @@ def _companion_link(autopilot: str, *, is_ours: bool) -> UdpLink:
 def _with_px4(cfg: SimConfig, binary: Path | None, stack: ExitStack, instance: int) -> Simulation:
     sitl = Px4Sitl(port=SIMULATOR_PORT + instance, seed=cfg.seed)
     stack.callback(sitl.close)
-    if binary is not None:
+    if binary is None:
+        _say(f"waiting for a PX4 (PX4_SIM_MODEL=none_iris) on TCP {sitl.port}")
+    else:
         sitl.process = stack.enter_context(start_px4(binary, parameters.PX4 | cfg.autopilot.params, instance=instance))
     simulation = Simulation(cfg, RealController(sitl), step_ns=PX4_STEP_NS, commands_per_step=PX4_COMMANDS_PER_STEP)
     sitl.attach(simulation.truth)
@@ -128,7 +131,9 @@ def _with_arducopter(cfg: SimConfig, binary: Path | None, stack: ExitStack, comp
         raise ConfigError(f"autopilot.params: {names}: are PX4's; a mission for ArduCopter has none")
     sitl = ArduPilotSitl(port=PHYSICS_PORT if binary is None else 0)
     stack.callback(sitl.close)
-    if binary is not None:
+    if binary is None:
+        _say(f"waiting for an ArduCopter (--model JSON:127.0.0.1) on UDP {sitl.port}")
+    else:
         ports = {"physics_port": sitl.port, "offboard_port": companion_port, "ground_port": GROUND_PORT}
         sitl.process = stack.enter_context(start_arducopter(binary, parameters.ARDUPILOT, **ports))
     simulation = Simulation(
@@ -136,3 +141,7 @@ def _with_arducopter(cfg: SimConfig, binary: Path | None, stack: ExitStack, comp
     )
     sitl.attach(simulation.truth)
     return simulation
+
+
+def _say(text: str) -> None:
+    Console(stderr=True).print(text, style="dim")
