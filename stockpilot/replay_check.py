@@ -26,6 +26,7 @@ from companion.geometry import rotation2, wrap_angle, yaw_from_quat
 from companion.lidar.ouster import OusterDecoder
 from companion.lidar.pcap import PcapReader
 from companion.messages import Array, LidarScan, OdometryEstimate, WallRanges
+from companion.recording import codec
 from companion.recording.replay import Replay
 from companion.recording.run_files import read_run
 from stockpilot.replay import recorded_config
@@ -38,6 +39,7 @@ TRUTH_NAME = "truth.csv"
 SHARED = "shared:"
 ODOMETRY = 331  # MAVLink common
 SETPOINT = 84
+TOLD = "told "  # before an event's name: how often it was told; 0 unless measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,9 @@ def check_folder(folder: Path) -> Outcome:
         return Outcome(folder.name, (), skipped=f"{content['recording']} is not here")
     measured = measure_folder(folder, content)
     expected: dict[str, dict[str, Any]] = content["expected"]
+    for name in expected:
+        if name.startswith(TOLD):
+            measured.setdefault(name, 0)
     missing = [name for name in expected if name not in measured]
     if missing:
         raise FileFormatError(
@@ -179,10 +184,15 @@ class _Watch:
             "odometry_rate_hz": (len(sent) - 1) / ((sent[-1] - sent[0]) * 1e-9) if len(sent) > 1 else 0.0,
             "odometry_max_gap_s": float(gaps.max()) if len(gaps) else None,
             "odometry_stops_after_s": (sent[-1] - lidar_ns[-1]) * 1e-9 if sent else None,
-            "requests": len(replay.messages.get("navigator/request", [])),
+            "control_requests": sum(
+                codec.fields(data)["kind"] in ("arm", "offboard")
+                for _, data in replay.messages.get("navigator/request", [])
+            ),
             "setpoints": sum(SETPOINT in message_ids(frame) for _, frame in replay.frames),
-            "events": ", ".join(dict.fromkeys(e.name for e in flight.events)),
         }
+        for event in flight.events:
+            name = TOLD + event.name
+            values[name] = int(values.get(name) or 0) + 1
         if estimates:
             values |= _motion(estimates)
             if truth is not None:
@@ -253,7 +263,7 @@ def rewrite(folder: Path) -> list[str]:
     measured = measure_folder(folder, content)
     changed = []
     for name, want in content["expected"].items():
-        got = measured[name]
+        got = measured.get(name, 0) if name.startswith(TOLD) else measured[name]
         new = round(got, 4) if isinstance(got, float) else got
         if new != want["value"]:
             changed.append(f"{folder.name}: {name} {want['value']} -> {new}")

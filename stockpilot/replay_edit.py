@@ -111,6 +111,27 @@ def _with_pixels_of(packet: bytes, other: bytes) -> bytes:
     return bytes(mixed)
 
 
+def _short_sight(inputs: list[Input], at: EditContext) -> list[Input]:
+    """Nothing comes back to the LiDAR from farther than max_m."""
+    limit_mm = round(float(at.values["max_m"]) * 1000)
+    return [
+        item._replace(data=_without_far(item.data, limit_mm)) if item.kind == "lidar" and at.is_within(item) else item
+        for item in inputs
+    ]
+
+
+def _without_far(packet: bytes, limit_mm: int) -> bytes:
+    """A packet of profile RNG19_RFL8_SIG16_NIR16 whose far ranges are 0, without checksum."""
+    size = (len(packet) - 64) // 16
+    words = np.frombuffer(packet, dtype=np.uint8)[32:-32].reshape(16, size).copy()
+    pixels = words[:, 12:].copy().view("<u4").reshape(16, -1, 3)
+    pixels[..., 0] = np.where(
+        (pixels[..., 0] & 0x7FFFF) > limit_mm, pixels[..., 0] & ~np.uint32(0x7FFFF), pixels[..., 0]
+    )
+    words[:, 12:] = pixels.reshape(16, -1).view(np.uint8)
+    return packet[:32] + words.tobytes() + packet[-32:-8] + bytes(8)
+
+
 def _flip(inputs: list[Input], at: EditContext) -> list[Input]:
     """One bit of every n-th packet of that kind is wrong."""
     kind, every = str(at.values["kind"]), int(at.values.get("every", 10))
@@ -125,6 +146,35 @@ def _flip(inputs: list[Input], at: EditContext) -> list[Input]:
                 item = item._replace(data=bytes(broken))
         out.append(item)
     return out
+
+
+def _not_a_number(inputs: list[Input], at: EditContext) -> list[Input]:
+    """Every n-th attitude of the flight controller is NaN, soundly framed."""
+    from pymavlink.dialects.v20 import common
+
+    every = int(at.values.get("every", 2))
+    parser = common.MAVLink(None)
+    out, n = [], 0
+    for item in inputs:
+        if item.kind == "mavlink" and at.is_within(item) and not _ATTITUDES.isdisjoint(message_ids(item.data)):
+            n += 1
+            if n % every == 0:
+                item = item._replace(data=b"".join(_with_nan(common, parser, f) for f in split_frames(item.data)))
+        out.append(item)
+    return out
+
+
+_ATTITUDES = {30, 31}  # ATTITUDE, ATTITUDE_QUATERNION
+
+
+def _with_nan(common: Any, parser: Any, frame: bytes) -> bytes:
+    for message in parser.parse_buffer(frame) or []:
+        if message.get_msgId() in _ATTITUDES:
+            setattr(message, "q1" if message.get_msgId() == 31 else "roll", float("nan"))
+            sender = common.MAVLink(None, message.get_srcSystem(), message.get_srcComponent())
+            sender.seq = message.get_seq()
+            return bytes(message.pack(sender))
+    return frame
 
 
 def _restart(inputs: list[Input], at: EditContext) -> list[Input]:
@@ -142,7 +192,9 @@ def _restart(inputs: list[Input], at: EditContext) -> list[Input]:
 
 
 _EDITS: dict[str, Edit] = {
-    "lose": _lose, "delay": _delay, "swap": _swap, "repeat": _repeat, "freeze": _freeze, "flip": _flip, "restart": _restart,
+    "lose": _lose, "delay": _delay, "swap": _swap, "repeat": _repeat, "freeze": _freeze, "flip": _flip, "nan": _not_a_number,
+    "short_sight": _short_sight,
+    "restart": _restart,
 }  # fmt: skip
 
 

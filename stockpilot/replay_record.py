@@ -61,12 +61,12 @@ SCENARIOS = {
     "dust": Scenario("cement_store.yaml", (110.0, 122.0), ("lidar.dust.visibility_m=15",)),
     "long_corridor": Scenario(
         "cement_store.yaml",
-        (58.0, 72.0),
+        (84.0, 98.0),
         (
-            "world.footprint=[[0,0],[160,0],[160,14],[0,14]]",
+            "world.footprint=[[0,0],[80,0],[80,14],[0,14]]",
             "world.piles=[]",
-            "vehicle.start=[80, 6, 180]",
-            "navigator.height_m=3",
+            "vehicle.start=[50, 7, 180]",
+            "navigator.height_m=5",
         ),
     ),
 }
