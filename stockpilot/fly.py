@@ -20,6 +20,7 @@ from companion.flight import Flight
 from companion.mapping.export import save_point_map
 from companion.messages import Event, Severity, VolumeReport
 from companion.recording.log import Recorder
+from companion.recording.manifest import write_manifest
 from companion.telemetry.mqtt import Telemetry
 from companion.topics import EVENT, Topic
 from stockpilot.leave import write_trajectory
@@ -156,6 +157,7 @@ def _write(folder: Path, flight: Flight, report: dict[str, Any], volume: VolumeR
             pictures["surface"] = draw_surface(folder / "surface.png", volume)
     write_report_page(folder / "report.html", report, pictures)
     write_json(folder / "report.json", report)
+    write_manifest(folder)
 
 
 def _read_metadata(path: Path | None) -> str | None:

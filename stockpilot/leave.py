@@ -9,6 +9,7 @@ import yaml
 
 from companion.mapping.export import save_point_map
 from companion.messages import Array, OdometryEstimate
+from companion.recording.manifest import write_manifest
 from companion.recording.tum import tum_line
 from stockpilot.pictures import draw_map, draw_surface, draw_trajectory
 from stockpilot.report import write_report_page
@@ -17,7 +18,7 @@ from stockpilot.run import Flown
 
 
 def write_results(folder: Path, flown: Flown) -> None:
-    """report.json last: where it is, the rest is whole."""
+    """report.json last but for the manifest: where it is, the rest is whole."""
     scored, outcome = flown.scored, flown.outcome
     save_point_map(scored.point_map, folder / "map.ply")
     save_point_map(scored.point_map, folder / "map.laz")
@@ -41,6 +42,7 @@ def write_results(folder: Path, flown: Flown) -> None:
         pictures["surface"] = draw_surface(folder / "surface.png", scored.volume)
     write_report_page(folder / "report.html", scored.report, pictures)
     write_json(folder / "report.json", scored.report)
+    write_manifest(folder)
 
 
 def write_trajectory(path: Path, estimates: list[OdometryEstimate]) -> None:
