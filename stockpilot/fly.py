@@ -148,10 +148,14 @@ def _write(folder: Path, flight: Flight, report: dict[str, Any], volume: VolumeR
     pictures: dict[str, Path] = {}
     if len(point_map.points_map):
         path = np.array([e.position_map_m for e in flight.keyframes], dtype=np.float64).reshape(-1, 3)
+        walls = [volume.footprint_m] if volume is not None and len(volume.footprint_m) else []
         pictures["trajectory"] = draw_trajectory(
-            folder / "trajectory.png", outlines=[volume.footprint_m] if volume is not None and len(volume.footprint_m) else [], truth_world_m=None,
-            estimated_world_m=path[:, :2], title=report["mission"],
-        )  # fmt: skip
+            folder / "trajectory.png",
+            outlines=walls,
+            truth_world_m=None,
+            estimated_world_m=path[:, :2],
+            title=report["mission"],
+        )
         pictures["map"] = draw_map(folder / "map.png", point_map)
         if volume is not None:
             pictures["surface"] = draw_surface(folder / "surface.png", volume)
