@@ -18,7 +18,7 @@ GRAVITY = 9.80665
 MAX_ACCELERATION = 3.0  # m/s^2 that tilt is believed to give
 VELOCITY_NOISE = 0.08  # m/s per sqrt(s): what neither tilt nor b explains
 ACCELERATION_WALK = 0.15  # m/s^2 per sqrt(s)
-YAW_NOISE = 0.0015  # rad per sqrt(s)
+YAW_NOISE = 0.001  # rad per sqrt(s)
 GYRO_WALK = 2e-5  # rad/s per sqrt(s)
 STEP_S = 0.02
 N = 8
@@ -53,7 +53,7 @@ def _carry(x: Array, p: Array, roll: Array, pitch: Array, yaw_gyro: Array, step_
         for k in range(2):
             p[2 + k, 2 + k] += 0.08**2 * step_s
             p[4 + k, 4 + k] += 0.15**2 * step_s
-        p[6, 6] += 0.0015**2 * step_s
+        p[6, 6] += 0.001**2 * step_s
         p[7, 7] += 2e-5**2 * step_s
     return x, p
 
@@ -81,14 +81,17 @@ _C = np.zeros((3, N))
 _C[[0, 1, 2], POSE] = 1.0
 
 
-def update(state: Planar, pose: Array, information: Array, prior_information: Array, floor_variance: Array) -> Planar:
+def update(
+    state: Planar, pose: Array, information: Array, apparent: Array, prior_information: Array, floor_variance: Array
+) -> Planar:
     """Fuse a registration that was found with a prior about the state's own pose.
 
     pose: (3,) where points and prior agree. information: (3, 3) of the points alone, may be singular.
+    apparent: (3, 3) the information that the registration itself went by.
     floor_variance: (3,) what a registration errs by however many points agree (the walls' own errors).
     """
-    shift = pose - state.x[POSE]
-    gradient = (information + prior_information) @ shift  # = H (ML pose - state's pose), also where H is singular
+    shift = (apparent + prior_information) @ (pose - state.x[POSE])  # = apparent (ML pose - state's pose)
+    gradient = information @ np.linalg.solve(apparent + 1e-3 * np.eye(3), shift)
     discount = np.linalg.inv(np.eye(3) + information * floor_variance)
     information = discount @ information
     total = np.linalg.inv(state.p)
@@ -132,10 +135,13 @@ def update_vertical(state: Vertical, z_m: float, variance: float) -> Vertical:
     return Vertical(state.t_ns, x, 0.5 * (p + p.T))
 
 
-def let_go(state: Planar) -> Planar:
-    """Standing has just ended: near the origin still, and slow."""
-    sigma = np.array([0.01, 0.01, 0.05, 0.05, 0.1, 0.1, 0.005, 2e-3])
-    return Planar(state.t_ns, np.zeros(N), np.diag(sigma**2))
+def let_go(state: Planar, gyro_offset_radps: float, stood_s: float) -> Planar:
+    """Standing has just ended: near the origin still, and slow; what the gyro read meanwhile is its offset."""
+    offset_sigma = min(2e-3, max(3e-5, 6e-4 / max(stood_s, 1e-3) ** 0.5))
+    sigma = np.array([0.01, 0.01, 0.05, 0.05, 0.1, 0.1, 0.005, offset_sigma])
+    x = np.zeros(N)
+    x[7] = gyro_offset_radps
+    return Planar(state.t_ns, x, np.diag(sigma**2))
 
 
 def let_go_vertical(state: Vertical, z_m: float) -> Vertical:

@@ -29,6 +29,7 @@ MIN_WEIGHT = 5.0
 MAX_SLENDER = 0.35  # variance across / along above which a window holds no line
 ANGULAR_SIGMA_RAD = 0.0015  # of a beam's direction: time stamps, attitude, the sensor's own
 TUKEY = 4.685
+NORMAL_SIGMA_RAD = 0.02  # what the normal of a window errs by however many points it holds: curves, steps
 NEIGHBOURS = 4  # on each side of a point
 CORRELATED = 8.0  # points of one scan that share a line, and so its error
 # A surface seen from one height only may lean: material lies at 35 deg and its outline shrinks as the vehicle climbs.
@@ -177,7 +178,10 @@ def residuals(
     sigma_surface_m: float,
     rows: Array,
 ) -> int:
-    """Per matched point, packed in order: index, residual in m, its sigma, derivative by yaw. rows: (N, 4) out."""
+    """Per matched point, packed in order: index, residual in m, its sigma, its derivative by yaw, distance to the line.
+
+    rows: (N, 5) out.
+    """
     flat = lines.reshape(-1, LINE)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     n = 0
@@ -201,6 +205,7 @@ def residuals(
         rows[n, 1] = line[NX] * dx + line[NY] * dy
         rows[n, 2] = math.sqrt(variance)
         rows[n, 3] = -line[NX] * py + line[NY] * px
+        rows[n, 4] = line[NX] * px + line[NY] * py
         n += 1
     return n
 
@@ -240,11 +245,13 @@ def normal_equations(
     mean_scale: float,
     system: Array,
     statistics: Array,
-) -> None:
+) -> float:
     """Sum the system, each point Tukey-weighted by its own residual and by what its neighbours err by together.
 
     system: (3, 4) out, H and g. statistics: (5,) out: sum of weights, inliers, weighted pose variance x, y, yaw.
+    Returns: the part of H about yaw that stems from errors of the normals alone: in a round silo, all of it.
     """
+    unsure = 0.0
     flat = lines.reshape(-1, LINE)
     system[:] = 0.0
     statistics[:] = 0.0
@@ -261,6 +268,9 @@ def normal_equations(
         system[0, 2] += w * line[NX] * jyaw
         system[1, 1] += w * line[NY] * line[NY]
         system[1, 2] += w * line[NY] * jyaw
+        head_on = rows[k, 4]
+        turned = line[ACROSS] / (line[WEIGHT] * line[ALONG]) + NORMAL_SIGMA_RAD**2
+        unsure += w * head_on * head_on * turned
         system[2, 2] += w * jyaw * jyaw
         system[0, 3] += w * line[NX] * r
         system[1, 3] += w * line[NY] * r
@@ -273,6 +283,7 @@ def normal_equations(
     system[1, 0] = system[0, 1]
     system[2, 0] = system[0, 2]
     system[2, 1] = system[1, 2]
+    return unsure
 
 
 @kernel
@@ -294,6 +305,14 @@ def solve3(a: Array, b: Array) -> Array:
 
 
 @kernel
+def without_translation(system: Array) -> float:
+    """Information about yaw when x and y are left free; at least 0."""
+    a, b, c = system[0, 0] + 1e-6, system[0, 1], system[1, 1] + 1e-6
+    u, v = system[0, 2], system[1, 2]
+    return max(float(system[2, 2] - (c * u * u - 2.0 * b * u * v + a * v * v) / max(a * c - b * b, 1e-12)), 0.0)
+
+
+@kernel
 def register_to_lines(
     sums: Array,
     spread: Array,
@@ -312,18 +331,19 @@ def register_to_lines(
 ) -> tuple[Array, Array, Array]:
     """Gauss-Newton on Tukey-weighted point-to-line residuals and a prior about the guess.
 
-    Returns: pose (3,); H (3, 3) of the points alone; (9,) iterations, converged, points matched, inliers, scale of the
-    residuals in their expected sigma, mean pose variance x, y, yaw of the lines used, share of the points matched.
+    Returns: pose (3,); H (3, 3) of the points alone; (10,) iterations, converged, points matched, inliers, scale of the
+    residuals in their expected sigma, mean pose variance x, y, yaw of the lines used, share of the points matched, and
+    the part of H about yaw that only stems from errors of the normals.
     """
     n = points.shape[0]
     found = np.empty(n, np.int64)
-    rows = np.empty((n, 4))
+    rows = np.empty((n, 5))
     means = np.empty(n)
     system = np.zeros((3, 4))
     statistics = np.zeros(5)
     pose = guess.copy()
-    out = np.zeros(9)
-    scale, mean_scale = 1.0, 1.0
+    out = np.zeros(10)
+    scale, mean_scale, unsure = 1.0, 1.0, 0.0
     for iteration in range(max_iterations):
         associate(sums, spread, state, lines, origin, cell_m, points, pose, gate_m, found)
         m = residuals(lines, points, found, pose, z_m, cell_m, sigma_range_m, sigma_surface_m, rows)
@@ -335,7 +355,7 @@ def register_to_lines(
         if iteration < 3:
             scale = robust_scale(rows[:m, 1] / rows[:m, 2], 0.7, 4.0)
             mean_scale = robust_scale(means[:m], scale / math.sqrt(2.0 * NEIGHBOURS + 1.0), 4.0)
-        normal_equations(lines, found, rows, m, means, scale, mean_scale, system, statistics)
+        unsure = normal_equations(lines, found, rows, m, means, scale, mean_scale, system, statistics)
         g = system[:, 3] + prior_information @ (pose - guess)
         step = solve3(system[:, :3] + prior_information, g)
         pose = pose - step
@@ -343,6 +363,7 @@ def register_to_lines(
             out[1] = 1.0
             break
     out[3] = statistics[1]
+    out[9] = min(unsure, without_translation(system))
     out[4] = scale
     if statistics[0] > 0.0:
         for k in range(3):

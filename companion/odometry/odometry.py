@@ -8,7 +8,7 @@ walls of the first keyframe hold the pose for the whole flight.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -45,6 +45,8 @@ MAX_PENDING = 100  # scans kept until the next keyframe
 STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
+SUDDEN_LOSS = 0.15  # share of the layer's points that lose their wall at once
+MIN_JUMP_M = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +94,7 @@ class Odometry:
         self._pending: list[_Pending] = []
         self._sigma_range_m = 0.1
         self._accepted = 0
+        self._usual_share = 0.0  # of the layer's points that found a wall, lately
         self._rejected_in_row = 0
         self._keyframe_t_ns = 0
         self._keyframe_z_m = 0.0
@@ -218,11 +221,14 @@ class Odometry:
         prior = np.asarray(np.linalg.inv(covariance + np.diag(PRIOR_SIGMA**2)), np.float64)
         registration = self.walls.register(layer, guess, prior, z_m=z_m, sigma_range_m=self._sigma_range_m)
         judgement = judge(registration, guess, covariance, len(layer))
+        if judgement.is_accepted and self._is_misplaced(registration, layer, guess, covariance, z_m):
+            judgement = replace(judgement, refused_because="fits better elsewhere")
         if judgement.is_accepted:
             self._rejected_in_row = 0
             self._accepted += 1
             self._track_noise(registration.scale)
-            planar = kalman.update(planar, registration.pose, registration.information, prior, FLOOR_SIGMA**2)
+            seen, apparent = registration.information, registration.apparent_information
+            planar = kalman.update(planar, registration.pose, seen, apparent, prior, FLOOR_SIGMA**2)
             return planar, registration, judgement, False
         self._rejected_in_row += 1
         self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
@@ -232,6 +238,24 @@ class Odometry:
                 self._rejected_in_row = 0
                 return kalman.restart(planar, found.pose), found, judge(found, found.pose, covariance, len(layer)), True
         return planar, registration, judgement, False
+
+    def _is_misplaced(
+        self, registration: Registration, layer: Array, guess: Array, covariance: Array, z_m: float
+    ) -> bool:
+        """Whether walls went missing all at once and are found again from a pose elsewhere.
+
+        Walls along the way of motion fit as well after a jump along them: only those across it are missed.
+        """
+        share = registration.inliers / max(len(layer), 1)
+        lost = self._usual_share - share
+        self._usual_share += 0.1 * (share - self._usual_share)
+        if lost < SUDDEN_LOSS or self._standstill.is_standing:
+            return False
+        found = relocalise(self.walls, layer, guess, covariance, z_m, self._sigma_range_m)
+        if found is None or found.inliers < registration.inliers + SUDDEN_LOSS * len(layer):
+            return False
+        self._usual_share = max(self._usual_share, found.inliers / len(layer))
+        return float(np.hypot(*(found.pose - registration.pose)[:2])) > MIN_JUMP_M
 
     def _track_noise(self, scale: float) -> None:
         """Learn the range noise from the residuals: fast at first, then slowly."""
@@ -257,7 +281,8 @@ class Odometry:
             return kalman.start(planar.t_ns), kalman.start_vertical(vertical.t_ns)
         self._base_variance = noise / max(1, self._standing_scans)
         del self._pending[-STANDING_DELAY:]
-        return kalman.let_go(planar), kalman.let_go_vertical(vertical, z_shift)
+        still = self._standstill
+        return kalman.let_go(planar, still.gyro_offset_radps, still.stood_s), kalman.let_go_vertical(vertical, z_shift)
 
     def _after(
         self,
@@ -278,8 +303,7 @@ class Odometry:
         climbed = abs(z_m - self._keyframe_z_m) > step_m
         is_keyframe = accepted and (due or climbed)
         planar_map = registration.map_variance + self._base_variance if accepted else old.map_variance[:3]
-        ratio = registration.inliers / max(1.0, registration.inliers / max(registration.matched_ratio, 0.01))
-        quality = max(1, min(100, round(100 * ratio))) if accepted else old.quality
+        quality = max(1, min(100, round(100 * registration.matched_ratio))) if accepted else old.quality
         if self._rejected_in_row >= FAILED_AFTER:
             quality = -1
         return Snapshot(

@@ -25,6 +25,9 @@ class Standstill:
         self._shifts: deque[Array] = deque(maxlen=RECENT)
         self._tilt: Array | None = None
         self._rangefinder: list[float] = []
+        self._since: tuple[int, float] | None = None  # time and gyro yaw when it began
+        self.stood_s = 0.0
+        self.gyro_offset_radps = 0.0
 
     @property
     def rangefinder_m(self) -> float | None:
@@ -55,4 +58,15 @@ class Standstill:
         )
         if moved:
             self.is_standing = False
+        else:
+            self._learn_gyro_offset(history)
         return self.is_standing
+
+    def _learn_gyro_offset(self, history: AttitudeHistory) -> None:
+        """What the gyro turned while nothing did; matters where walls do not tell yaw (a round silo)."""
+        t_ns, yaw = int(history.t_ns[-1]), float(history.values[-1, 2])
+        if self._since is None:
+            self._since = t_ns, yaw
+        self.stood_s = (t_ns - self._since[0]) * 1e-9
+        if self.stood_s >= 2.0:
+            self.gyro_offset_radps = (yaw - self._since[1]) / self.stood_s

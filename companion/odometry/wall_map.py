@@ -18,7 +18,8 @@ MAX_CELLS = 4_000_000  # 36 hectares at 0.3 m; points beyond are left out
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """What one registration gave. pose: x, y, yaw in map. information: (3, 3) of the points alone, inverse covariance.
+    """What one registration gave. pose: x, y, yaw in map. information: (3, 3) of the points alone, inverse covariance;
+    apparent_information: the same with what about yaw only stems from errors of the lines' normals.
 
     scale: robust spread of the residuals over what the noise lets expect. matched_ratio: share of the points with a
     wall to go to. map_variance: (3,) of the pose of the map itself where it was used.
@@ -26,6 +27,7 @@ class Registration:
 
     pose: Array
     information: Array
+    apparent_information: Array
     converged: bool
     iterations: int
     inliers: int
@@ -94,9 +96,12 @@ class WallMap:
             gate_m,
             max_iterations,
         )
+        believed = information.copy()
+        believed[2, 2] -= out[9]
         return Registration(
             pose=pose,
-            information=information,
+            information=believed,
+            apparent_information=information,
             converged=bool(out[1]),
             iterations=int(out[0]),
             inliers=int(out[3]),

@@ -155,6 +155,7 @@ class Noise:
     range_m: float = 0.12
     tilt_deg: float = 0.3  # wandering, over 20 s
     tilt_bias_deg: tuple[float, float] = (0.0, 0.0)
+    tilt_white_rad: float = 5e-4
     gyro_radps: float = 0.002
     gyro_bias_radps: float = 0.0005
     rangefinder_m: float = 0.02
@@ -209,7 +210,9 @@ def stream(
         t_end = 0.1 * (frame + 1)
         while k < len(track.t_s) and track.t_s[k] <= t_end + 0.011:
             wander += -wander * 0.02 / 20.0 + rng.normal(size=2) * math.radians(noise.tilt_deg) * math.sqrt(0.04 / 20.0)
-            roll, pitch = track.rpy[k, :2] + wander + np.radians(noise.tilt_bias_deg) + rng.normal(size=2) * 5e-4
+            roll, pitch = (
+                track.rpy[k, :2] + wander + np.radians(noise.tilt_bias_deg) + rng.normal(size=2) * noise.tilt_white_rad
+            )
             ahead, back = min(k + 1, len(track.t_s) - 1), max(k - 1, 0)
             rate = (track.rpy[ahead] - track.rpy[back]) / max(track.t_s[ahead] - track.t_s[back], 1e-9)
             rate = rate + rng.normal(size=3) * noise.gyro_radps + (0, 0, noise.gyro_bias_radps)
