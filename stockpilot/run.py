@@ -22,7 +22,7 @@ from simbridge.world import World
 from stockpilot.lockstep import Lockstep, Outcome, Wire
 from stockpilot.mission import Mission, load_mission
 from stockpilot.results import Scored, score_flight
-from stockpilot.wires import EmulatedWire, emulated_autopilot
+from stockpilot.wires import OFFBOARD, EmulatedWire, emulated_autopilot
 
 SECONDS_BEYOND_FLIGHT = 300.0  # on the ground: time sync, vision, arming
 
@@ -50,10 +50,10 @@ class Prepared:
     closing: ExitStack = field(default_factory=ExitStack)
 
 
-def emulated(cfg: SimConfig) -> tuple[Simulation, Autopilot]:
+def emulated(cfg: SimConfig, links: tuple[str, ...] = (OFFBOARD,)) -> tuple[Simulation, Autopilot]:
     """The world with the emulated flight controller. Raises: ConfigError: an unknown parameter."""
     try:
-        controller = emulated_autopilot(cfg)
+        controller = emulated_autopilot(cfg, links)
     except ValueError as error:
         raise ConfigError(f"autopilot.params: {error}") from None
     return Simulation(cfg, controller), controller

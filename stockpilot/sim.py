@@ -50,7 +50,7 @@ def sim_command(
     if autopilot == "emulated":
         from stockpilot.run import emulated
 
-        simulation, endpoint = emulated(mission.sim)
+        simulation, endpoint = emulated(mission.sim, ("offboard", "gcs"))
         links = {
             name: open_link(f"--{name}", url, PX4_LOCAL_PORT[name])
             for name, url in (("offboard", offboard), ("gcs", ground))

@@ -13,12 +13,12 @@ OFFBOARD = "offboard"
 BATTERY: dict[str, float] = {"SIM_BAT_DRAIN": 1800}  # s to empty; PX4's default is made for demonstrations: 60 s
 
 
-def emulated_autopilot(cfg: SimConfig) -> Autopilot:
+def emulated_autopilot(cfg: SimConfig, links: tuple[str, ...]) -> Autopilot:
     """The emulated flight controller, set up for flight on vision; the mission's own parameters come on top.
 
     Raises: ConfigError: an unknown parameter.
     """
-    return Autopilot({**PX4_VISION, **BATTERY, **cfg.autopilot.params}, seed=cfg.seed)
+    return Autopilot({**PX4_VISION, **BATTERY, **cfg.autopilot.params}, seed=cfg.seed, links=links)
 
 
 class EmulatedWire:
