@@ -27,6 +27,7 @@ _ON_GROUND = 1
 # SYS_STATUS, ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, DISTANCE_SENSOR, EXTENDED_SYS_STATE
 _STREAMS_HZ = {1: 2.0, 30: 10.0, 31: 10.0, 32: 5.0, 132: 2.0, 245: 2.0}
 _SETTLE_S = 1.2
+_HEARTBEAT_FRESH_S = 1.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +52,8 @@ async def gather(link: VehicleLink, around: Surroundings, *, probe: Probe | None
     await asyncio.sleep(max(0.0, seconds - (time.monotonic() - started)))
     span = time.monotonic() - started
     rates = {name: (link.counts[name] - counts[name]) / span for name in link.counts}
+    if time.monotonic() - link.arrived_s.get("HEARTBEAT", 0.0) < _HEARTBEAT_FRESH_S:
+        rates["HEARTBEAT"] = max(rates["HEARTBEAT"], 1.0 / _HEARTBEAT_FRESH_S)  # rarer than a short look is long
 
     flags = _flags(link, dialect)
     fused = None if flags is None else dialect.is_vision_fused(flags)

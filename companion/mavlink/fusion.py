@@ -133,13 +133,17 @@ def _sent_frame(vision: SentVision, facts: Facts) -> Gate | None:
 
 
 def _estimator_type(facts: Facts) -> Gate | None:
+    """By what was sent, where that is known; else by the autopilot's words, which may be late."""
     vision = facts.vision
-    refused = any("estimator_type" in text and "unsupported" in text for text in facts.texts)
-    sent = vision is not None and facts.autopilot == "px4" and vision.estimator_type not in _FUSED_TYPES
-    if not refused and not sent:
+    if vision is None:
+        is_refused = any("estimator_type" in text and "unsupported" in text for text in facts.texts)
+        found = "the autopilot refuses it in words" if is_refused else ""
+    else:
+        is_fused = facts.autopilot != "px4" or vision.estimator_type in _FUSED_TYPES
+        found = "" if is_fused else f"estimator_type {vision.estimator_type}"
+    if not found:
         return None
-    number = f"estimator_type {vision.estimator_type}" if vision is not None else "the autopilot refuses it in words"
-    return number, "VIO (3)", "PX4 takes UNKNOWN, NAIVE, VISION, VIO; MOCAP goes where its EKF does not look"
+    return found, "VIO (3)", "PX4 takes UNKNOWN, NAIVE, VISION, VIO; MOCAP goes where its EKF does not look"
 
 
 def _quaternion(facts: Facts) -> Gate | None:
