@@ -90,6 +90,7 @@ class Odometry:
         self.walls = WallMap()
         self.height = HeightTracker(cfg.lidar.mount_position_m[2])
         self._standstill = Standstill()
+        self._is_released = False  # the filter, from standing at the origin
         self._standing_scans = 0
         self._pending: list[_Pending] = []
         self._sigma_range_m = 0.1
@@ -156,7 +157,7 @@ class Odometry:
             self.height.is_standing = self._standstill.is_standing
             vertical, fit = self.height.update(lower, planar, vertical, history, self.walls, self._sigma_range_m)
             ground = fit.new_ground
-            if self._standstill.is_standing:
+            if not self._is_released:
                 planar, vertical = self._stand(
                     history, planar, vertical, registration, fit.correction[0], fit.z_sigma_m
                 )
@@ -279,6 +280,7 @@ class Odometry:
         if self._standstill.on_scan(history, shift, np.sqrt(np.append(noise, z_sigma**2))):
             self._standing_scans += 1
             return kalman.start(planar.t_ns), kalman.start_vertical(vertical.t_ns)
+        self._is_released = True
         self._base_variance = noise / max(1, self._standing_scans)
         del self._pending[-STANDING_DELAY:]
         still = self._standstill
