@@ -14,7 +14,7 @@ import numpy as np
 from companion.messages import PointMap
 from companion.volume.floor import Floor
 from companion.volume.interval import Evidence
-from companion.volume.surface import Cells
+from companion.volume.surface import Cells, CellState
 from companion.volume.walls import Footprint
 
 BEYOND_WALLS = 0.03  # of all returns; an open door lets out less
@@ -22,7 +22,8 @@ IN_THE_AIR = 0.05  # of the returns within the walls
 WALLS_DOUBLED_M = 0.06  # disagreement of keyframes on the walls; good poses keep within 0.03 m
 FLOOR_BENT_M = 0.04  # undulation; power-floated and dozed floors keep within 0.02 m
 FLOOR_SEEN = 0.03  # of the area within the walls
-UNSEEN = 0.05
+UNSEEN = 0.05  # of the floor
+UNSEEN_IN_PILE = 0.01
 THIN_CELLS = 4.0  # returns in the median cell
 
 
@@ -81,6 +82,9 @@ def doubt(
         said.append(f"the floor departs from a plane by {floor.undulation_m:.2f} m (1 sigma) over a few metres")
     if unseen > UNSEEN:
         said.append(f"{100 * unseen:.0f} % of the floor was not seen: what lies there is guessed from its surroundings")
+    hidden = float(area[e.pile & (e.surface.state == CellState.UNSEEN)].sum()) / pile_area if pile_area else 0.0
+    if hidden > UNSEEN_IN_PILE:
+        said.append(f"{100 * hidden:.0f} % of the pile's own area was not seen: its height there is guessed")
     thin = float(np.median(cells.kept[cells.seen])) if cells.seen.any() else 0.0
     if thin < THIN_CELLS:
         said.append(f"the map is thin: {thin:.0f} returns in the median cell of {e.grid.cell_m:g} m")

@@ -53,7 +53,9 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
         floor = fit_floor(grid, cells.x, cells.y, cells.z, cells.sigma_m, usable)
     else:
         floor = level_floor(grid, floor_z_m)
-    surface = build_surface(grid, cells, footprint.share > 0, strip, INTERPOLATION_REACH_M)
+    surface = build_surface(
+        grid, cells, footprint.share > 0, strip, reach_m=INTERPOLATION_REACH_M, strip_width_m=footprint.margin_m
+    )
     return _report(point_map, cfg, grid, footprint, cells, floor, surface)
 
 

@@ -171,14 +171,19 @@ class Surface:
     slope_y: Array
 
 
-def build_surface(grid: Grid, cells: Cells, inside: Mask, strip: Mask, reach_m: float) -> Surface:
+def build_surface(
+    grid: Grid, cells: Cells, inside: Mask, strip: Mask, *, reach_m: float, strip_width_m: float
+) -> Surface:
     """Linear between the seen cells (Delaunay), the local plane carried on into the strip along the walls.
 
     inside: cells to fill. strip: cells too near to a wall to trust their returns. Cells farther than reach_m from
     any seen one are filled all the same, and called unseen.
     """
     seen = cells.seen & ~strip
-    planes = local_planes(grid, cells.x, cells.y, cells.z, np.where(seen, 1.0, 0.0), radius_cells=cells_of(0.5, grid))
+    # The wider the strip, the wider the base that the slope into it is taken from: noise asks for both alike.
+    radius = cells_of(max(0.5, strip_width_m), grid)
+    weight = np.where(seen, np.minimum(cells.kept, 20.0), 0.0)
+    planes = local_planes(grid, cells.x, cells.y, cells.z, weight, radius_cells=radius)
     z = np.full(grid.shape, np.nan)
     gap = np.full(grid.shape, np.inf)
     if seen.any():
