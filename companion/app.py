@@ -19,7 +19,7 @@ from companion.cadence import Cadence
 from companion.flight import Flight
 from companion.lidar.udp import LidarSocket, open_lidar
 from companion.mavlink.link import MavlinkLink, open_link
-from companion.messages import LidarScan, OperatorCommand, OperatorCommandKind
+from companion.messages import Event, LidarScan, OperatorCommand, OperatorCommandKind, Severity
 from companion.odometry import ScanResult
 
 SWITCH_INTERVAL_S = 0.001  # how long a thread may keep the interpreter from the beat
@@ -93,7 +93,9 @@ class App:
                 return
             except Exception as error:  # of the outer ring: told, counted, never the end of a flight
                 self.restarts[name] = self.restarts.get(name, 0) + 1
-                self.flight.tell_failure(time.monotonic_ns(), name, error)
+                text = f"{name} failed and is started again: {type(error).__name__}: {error}"
+                t_ns, severity = time.monotonic_ns(), Severity.WARNING
+                self.flight.on_event(Event(t_ns=t_ns, severity=severity, name=f"{name}_failed", text=text))
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, 10.0)
 
@@ -106,7 +108,7 @@ class App:
             now_ns = time.monotonic_ns()
             overloaded = self.cadence.lag(now_ns, now_ns - deadline_ns)
             if overloaded is not None:
-                self.flight.tell(overloaded)
+                self.flight.on_event(overloaded)
             self.flight.poll(now_ns)
             self._send()
             if self.flight.is_finished and finished_ns is None:

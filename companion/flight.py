@@ -8,6 +8,8 @@ its result in. Every call that changes anything is told to `record` first, in or
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -15,7 +17,9 @@ from companion import topics
 from companion.config import CompanionConfig
 from companion.lidar.ouster import OusterDecoder
 from companion.mapping import Mapper
+from companion.mavlink.computer import ComputerStatus
 from companion.mavlink.session import MavlinkSession
+from companion.mavlink.signing import Signer
 from companion.messages import (
     AttitudeSample,
     Event,
@@ -72,6 +76,7 @@ class Flight:
     lidar_metadata_json: str | None = None
     tap: Tap = _no_tap
     record: Record = _no_record
+    signer: Signer | None = None
     decoder: OusterDecoder = field(init=False)
     session: MavlinkSession = field(init=False)
     odometry: Odometry = field(init=False)
@@ -99,7 +104,7 @@ class Flight:
             self.decoder = OusterDecoder(self.lidar_metadata_json)
         else:
             self.decoder = OusterDecoder.from_config(config.lidar)
-        self.session = MavlinkSession(config.mavlink)
+        self.session = MavlinkSession(config.mavlink, signer=self.signer)
         self.odometry = Odometry(config)
         self.navigator = Navigator(config)
         self.guard = Guard(config)
@@ -162,6 +167,8 @@ class Flight:
         """Do what is due: estimates, setpoints, heartbeats. Call at `next_deadline_ns`, or more often."""
         self.record("poll", t_ns, b"", None)
         self.session.poll(t_ns)
+        for event in self.session.take_events():
+            self.tell(event)
         if self._odometry_beat.due(t_ns):
             estimate = self.odometry.predict(t_ns)
             if estimate is not None:
@@ -172,10 +179,24 @@ class Flight:
         if self._setpoint_beat.due(t_ns):
             self._navigate(t_ns)
 
-    def tell_failure(self, t_ns: int, task: str, error: Exception) -> None:
-        """A task of the outer ring failed: say so and go on."""
-        text = f"{task} failed and is started again: {type(error).__name__}: {error}"
-        self.tell(Event(t_ns=t_ns, severity=Severity.WARNING, name=f"{task}_failed", text=text))
+    def on_event(self, event: Event) -> None:
+        """An event from outside the core: the recorder's disk is full, a task failed, a beat came late."""
+        told = {"severity": int(event.severity), "name": event.name, "text": event.text}
+        self.record("told", event.t_ns, json.dumps(told).encode(), None)
+        self.tell(event)
+
+    def on_computer(self, status: ComputerStatus) -> None:
+        """How the companion's computer fares: the ground station hears it."""
+        self.record("told", status.t_ns, json.dumps(dataclasses.asdict(status)).encode(), None)
+        self.session.send_computer_status(status)
+
+    def on_told(self, payload: bytes, t_ns: int) -> None:
+        """What `on_event` or `on_computer` recorded, again."""
+        told = json.loads(payload)
+        if "name" in told:
+            self.on_event(Event(t_ns=t_ns, severity=Severity(told["severity"]), name=told["name"], text=told["text"]))
+        else:
+            self.on_computer(ComputerStatus(**{**told, "cpu_core_ratios": tuple(told["cpu_core_ratios"])}))
 
     # ---- out --------------------------------------------------------------------------------------------------------
 

@@ -14,10 +14,12 @@ import typer
 from rich.console import Console
 
 from companion.app import App
+from companion.computer import read_computer
 from companion.config import TelemetryConfig
 from companion.errors import FileFormatError
 from companion.flight import Flight
 from companion.mapping.export import save_point_map
+from companion.mavlink.keys import open_signer
 from companion.messages import Event, Severity, VolumeReport
 from companion.recording.log import Recorder
 from companion.recording.manifest import write_manifest
@@ -29,7 +31,7 @@ from stockpilot.recorded import listen, open_recorder
 from stockpilot.results import write_json
 from stockpilot.telemetry import DELIVERY_S, mqtt_task, mqtt_telemetry
 
-RECORDER_PERIOD_S = 1.0
+HOUSEKEEPING_PERIOD_S = 1.0
 STYLES = {Severity.WARNING: "yellow", Severity.NOTICE: "cyan", Severity.INFO: "dim", Severity.DEBUG: "dim"}
 
 
@@ -43,15 +45,16 @@ def fly_command(
     folder = out or Path("runs") / f"{mission.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)
-    flight = Flight(config=mission.companion, lidar_metadata_json=metadata)
+    key_file = mission.companion.mavlink.signing_key_file
+    signer = open_signer(Path(key_file)) if key_file is not None else None
+    flight = Flight(config=mission.companion, lidar_metadata_json=metadata, signer=signer)
     recorder: Recorder | None = None
     if record and mission.companion.recording.enabled:
         recorder = open_recorder(folder, mission, lidar_metadata_json=metadata, autopilot="unknown", threaded=True)
         listen(recorder, flight)
     _tell_events(flight, console)
     app = App(flight=flight, connect=connect, lidar=lidar, on_sent=recorder.output if recorder else None)
-    if recorder is not None:
-        app.housekeeping = _housekeeping(recorder, flight)
+    app.housekeeping = _housekeeping(recorder, flight, folder)
     spool = folder / "mqtt"
     if mission.companion.telemetry.mqtt_url is not None:
         app.telemetry = mqtt_task(mqtt_telemetry(mission.companion.telemetry, flight, spool), flight)
@@ -191,11 +194,15 @@ def _tell_events(flight: Flight, console: Console) -> None:
     flight.tap = tap
 
 
-def _housekeeping(recorder: Recorder, flight: Flight) -> Callable[[], Any]:
+def _housekeeping(recorder: Recorder | None, flight: Flight, folder: Path) -> Callable[[], Any]:
+    """Once a second: how the recording and the computer fare."""
+
     async def watch() -> None:
         while True:
-            await asyncio.sleep(RECORDER_PERIOD_S)
-            for event in recorder.take_events(time.monotonic_ns()):
-                flight.tell(event)
+            await asyncio.sleep(HOUSEKEEPING_PERIOD_S)
+            now = time.monotonic_ns()
+            flight.on_computer(read_computer(now, folder))
+            for event in recorder.take_events(now) if recorder is not None else ():
+                flight.on_event(event)
 
     return watch

@@ -22,6 +22,7 @@ INPUTS = (
     "accept",
     "operator",
     "begin",
+    "told",
 )  # what goes into the flight core, in the order it went
 INPUT_IDS = {kind: n + 1 for n, kind in enumerate(INPUTS)}
 OUTPUT_ID = 8

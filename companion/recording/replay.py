@@ -76,6 +76,8 @@ class Replay:
             self._accept(t_ns)
         elif item.kind == "operator":
             self._operator(item)
+        elif item.kind == "told":
+            flight.on_told(item.data, t_ns)
         self.frames += [(t_ns, frame) for frame in flight.take_output()]
 
     def _begin(self, t_ns: int) -> None:

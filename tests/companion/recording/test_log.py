@@ -314,6 +314,7 @@ def test_channel_numbers_are_those_of_older_recordings() -> None:
         "in/accept": 4,
         "in/operator": 5,
         "in/begin": 6,
+        "in/told": 7,
         "out/mavlink": 8,
         "/pose": 10,
         "/tf": 11,
