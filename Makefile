@@ -63,10 +63,11 @@ bench: setup
 	$(BIN)/python -m benchmarks.registration
 
 sweep: setup
-	$(BIN)/stockpilot sweep missions/paper_sweep.yaml
+	$(BIN)/stockpilot sweep missions/paper_sweep.yaml --docs docs/results.md
 
 campaign: setup
-	$(BIN)/python -m benchmarks.campaign
+	for sweep in acceptance worlds noise dust walls wind vibration attitude mount packets interval; do \
+	  $(BIN)/stockpilot sweep missions/sweeps/$$sweep.yaml --docs docs/results.md || true; done
 
 replay: setup
 	$(BIN)/python -m stockpilot.replay_check

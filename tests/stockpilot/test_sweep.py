@@ -11,7 +11,14 @@ import pytest
 
 from companion.errors import ConfigError
 from stockpilot.sweep import SweepRun, load_sweep, read_results
-from stockpilot.sweep_report import fill_document, flat_row, is_confident_and_wrong, summarise, trends, write_sweep_report
+from stockpilot.sweep_report import (
+    fill_document,
+    flat_row,
+    is_confident_and_wrong,
+    summarise,
+    trends,
+    write_sweep_report,
+)
 
 MISSIONS = Path(__file__).resolve().parents[2] / "missions"
 SWEEPS = [MISSIONS / "paper_sweep.yaml", *sorted((MISSIONS / "sweeps").glob("*.yaml"))]
@@ -53,7 +60,9 @@ def test_bad_sweep_is_refused_before_anything_flies(tmp_path: Path, text: str, t
     assert told in str(error.value)
 
 
-def result(name: str, *, speed: float, seed: int, e_p: float, e_v: float, keyframes: int, **more: Any) -> dict[str, Any]:
+def result(
+    name: str, *, speed: float, seed: int, e_p: float, e_v: float, keyframes: int, **more: Any
+) -> dict[str, Any]:
     report = {
         "state": "completed", "collision": False, "e_p_m": e_p, "e_v_percent": e_v, "keyframes": keyframes,
         "c_c": 4 * keyframes, "volume_m3": 1000 + 10 * e_v, "truth_volume_m3": 1000.0, "truth_in_interval": True,
@@ -105,7 +114,9 @@ def test_trend_of_the_papers_pipeline_is_told_as_it_is() -> None:
 
 def test_document_is_filled_between_its_markers_only(tmp_path: Path) -> None:
     path = tmp_path / "results.md"
-    path.write_text("before\n<!-- sweep demo: begin -->\nSTALE-TABLE\n<!-- sweep demo: end -->\nafter\n", encoding="utf-8")
+    path.write_text(
+        "before\n<!-- sweep demo: begin -->\nSTALE-TABLE\n<!-- sweep demo: end -->\nafter\n", encoding="utf-8"
+    )
     fill_document(path, "demo", RESULTS, command="stockpilot sweep demo.yaml")
     text = path.read_text(encoding="utf-8")
     assert text.startswith("before\n")
