@@ -24,6 +24,7 @@ SENSOR_ABOVE_BASE_M = 0.03618  # origin of the lidar frame above that of the sen
 SERIAL = 992100000000
 INIT_ID = 1
 ALBEDO = 40
+RANGE_MASK = np.uint32(0x7FFFF)  # 19 bits
 UDP_PORT_LIDAR = 7502  # Ouster's own
 
 
@@ -70,30 +71,63 @@ def directions_sensor(cfg: LidarSimConfig) -> Array:
 class PacketWriter:
     """Lidar packets of COLUMNS_PER_PACKET columns each, as they are measured.
 
-    Fill range_mm (rows, 16) uint32 and signal (rows, 16) uint16 and call `pack`. ouster-sdk packs whole frames, so
-    this gives it a frame of just one packet's width and then sets the columns' numbers within the turn.
+    Fill range_mm (rows, 16) uint32 and signal (rows, 16) uint16 and call `pack`. ouster-sdk packs whole frames only, and
+    slowly: this has it pack one packet, and then overwrites in that what changes (a test packs the same by the SDK).
     """
 
     def __init__(self, cfg: LidarSimConfig) -> None:
-        info, narrow = sensor_info(cfg), sensor_info(cfg)
-        narrow.format.columns_per_frame = COLUMNS_PER_PACKET
-        narrow.format.column_window = (0, COLUMNS_PER_PACKET - 1)
-        self._format = core.PacketFormat(info)
-        self._frame = core.LidarFrame(narrow)
-        self.range_mm: NDArray[np.uint32] = self._frame.field("RANGE")
-        self.signal: NDArray[np.uint16] = self._frame.field("SIGNAL")
-        self._reflectivity = self._frame.field("REFLECTIVITY")
-        self._reflectivity[:] = ALBEDO
-        self._frame.status[:] = 1
-        self._timestamp = self._frame.timestamp
+        self._format = core.PacketFormat(sensor_info(cfg))
         self._max_frame_id = int(self._format.max_frame_id)
+        self.range_mm: NDArray[np.uint32] = np.zeros((cfg.rows, COLUMNS_PER_PACKET), dtype=np.uint32)
+        self.signal: NDArray[np.uint16] = np.zeros((cfg.rows, COLUMNS_PER_PACKET), dtype=np.uint16)
+        self._bytes: NDArray[np.uint8] = _template(cfg, self._format)
+        packet = self._bytes.view(_packet_type(cfg.rows, self._format))  # (1,)
+        self._frame_id, self._crc = packet["frame_id"], packet["crc"]
+        column = packet["column"][0]
+        self._stamp, self._measurement = column["stamp"], column["measurement_id"]
+        self._range, self._signal = column["pixel"]["range"], column["pixel"]["signal"]
+        self._offsets = np.arange(COLUMNS_PER_PACKET, dtype=np.uint16)
 
     def pack(self, frame_id: int, first_column: int, t_sensor_ns: NDArray[np.int64]) -> bytes:
         """The packet of columns first_column to first_column + 15 of a turn, measured at t_sensor_ns (16,)."""
-        self._frame.frame_id = frame_id % (self._max_frame_id + 1)
-        self._timestamp[:] = t_sensor_ns
-        packet: Any = core.frame_to_packets(self._frame, self._format, INIT_ID, SERIAL)[0]
-        for k in range(COLUMNS_PER_PACKET):
-            self._format.set_col_measurement_id(packet, k, first_column + k)
-        packet.buf[-8:] = np.frombuffer(packet.calculate_crc().to_bytes(8, "little"), dtype=np.uint8)
-        return bytes(packet.buf)
+        self._frame_id[0] = frame_id % (self._max_frame_id + 1)
+        self._stamp[:] = t_sensor_ns
+        self._measurement[:] = self._offsets + np.uint16(first_column)
+        self._range[:] = self.range_mm.T & RANGE_MASK
+        self._signal[:] = self.signal.T
+        self._crc[0] = self._format.calculate_crc(self._bytes)
+        return self._bytes.tobytes()
+
+
+def _template(cfg: LidarSimConfig, packet_format: Any) -> NDArray[np.uint8]:
+    """One packet by ouster-sdk, of a frame just as wide, with nothing measured in it."""
+    narrow = sensor_info(cfg)
+    narrow.format.columns_per_frame = COLUMNS_PER_PACKET
+    narrow.format.column_window = (0, COLUMNS_PER_PACKET - 1)
+    frame = core.LidarFrame(narrow)
+    frame.field("REFLECTIVITY")[:] = ALBEDO
+    frame.status[:] = 1
+    packet: Any = core.frame_to_packets(frame, packet_format, INIT_ID, SERIAL)[0]
+    return np.array(packet.buf, dtype=np.uint8)
+
+
+def _packet_type(rows: int, packet_format: Any) -> np.dtype[np.void]:
+    """What `pack` writes of a packet of profile RNG19_RFL8_SIG16_NIR16, as a numpy record."""
+    pixel = np.dtype({"names": ["range", "signal"], "formats": ["<u4", "<u2"], "offsets": [0, 6], "itemsize": 12})
+    column = np.dtype(
+        {
+            "names": ["stamp", "measurement_id", "pixel"],
+            "formats": ["<u8", "<u2", (pixel, (rows,))],
+            "offsets": [0, 8, packet_format.col_header_size],
+            "itemsize": packet_format.col_size,
+        }
+    )
+    size = packet_format.lidar_packet_size
+    return np.dtype(
+        {
+            "names": ["frame_id", "column", "crc"],
+            "formats": ["<u2", (column, (COLUMNS_PER_PACKET,)), "<u8"],
+            "offsets": [2, packet_format.packet_header_size, size - 8],
+            "itemsize": size,
+        }
+    )
