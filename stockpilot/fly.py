@@ -119,6 +119,9 @@ def volume_keys(volume: VolumeReport | None) -> dict[str, Any]:
         "seen_ratio": volume.seen_ratio if volume else None,
         "interpolated_ratio": volume.interpolated_ratio if volume else None,
         "unseen_ratio": volume.unseen_ratio if volume else None,
+        "floor_area_m2": volume.floor_area_m2 if volume else None,
+        "pile_area_m2": volume.pile_area_m2 if volume else None,
+        "error_budget_m3": dict(volume.error_budget_m3) if volume else {},
         "warnings": list(volume.warnings) if volume else ["nothing was mapped"],
     }
 

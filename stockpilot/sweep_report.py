@@ -30,14 +30,20 @@ def flat_row(result: Result) -> dict[str, Any]:
     for key, value in report.items():
         if key == "paper":
             row.update({f"paper_{name}": item for name, item in value.items()})
-        elif key == "events":
-            row["events"] = len(value)
+        elif key in ("events", "warnings"):
+            row[key] = len(value)
+        elif key == "error_budget_m3":
+            row.update({f"sigma_{_slug(name)}_m3": item for name, item in value.items()})
         elif key == "volume_interval_m3":
             low, high = value if value else (None, None)
             row["volume_interval_low_m3"], row["volume_interval_high_m3"] = low, high
         else:
             row[key] = _cell(value)
     return row
+
+
+def _slug(name: str) -> str:
+    return "_".join(name.lower().split())
 
 
 def _cell(value: Any) -> Any:
