@@ -16,6 +16,7 @@ import typer
 from companion.errors import FileFormatError
 from companion.messages import Array, PointMap
 from companion.recording.tum import seconds
+from stockpilot.planar import PlanarMatcher
 from stockpilot.scan_files import FileScan, ScanFile, open_scans
 
 MAP_EVERY_M = 0.3  # a scan goes into the map when the scanner has moved this far or turned this much
@@ -43,9 +44,7 @@ class Track:
 
 def track(scans: Iterator[FileScan], *, with_map: bool = False) -> Track:
     """Run the odometry over scans in their order; one whose time does not follow the last one's is left out."""
-    from companion.odometry import ScanMatcher2D
-
-    matcher = ScanMatcher2D()
+    matcher = PlanarMatcher()
     found = Track()
     last_map: Array | None = None
     began = time.perf_counter()
@@ -54,10 +53,10 @@ def track(scans: Iterator[FileScan], *, with_map: bool = False) -> Track:
             found.out_of_order += 1
             continue
         match = matcher.match(scan.points, scan.t_ns)
-        pose = np.asarray(match.pose, dtype=np.float64)
+        pose = match.pose
         found.t_ns.append(scan.t_ns)
         found.poses.append(pose)
-        found.converged.append(bool(match.converged))
+        found.converged.append(match.converged)
         if with_map and match.converged and _has_moved(last_map, pose):
             last_map = pose
             found.map_points.append(_placed(scan.points_3d, pose))
