@@ -21,6 +21,11 @@ PX4_VISION: Parameters = {
     "NAV_DLL_ACT": 0,
     "NAV_RCL_ACT": 3,  # land, not return
 }
+PX4_HALL: Parameters = {
+    "RTL_RETURN_ALT": 5,  # metres: no climb under a roof
+    "GF_MAX_HOR_DIST": 500,
+    "GF_MAX_VER_DIST": 30,
+}
 PX4_SIMULATION: Parameters = {
     "SIM_BAT_DRAIN": 0,  # else the simulated battery is flat after a minute
     "THR_MDL_FAC": 0.65,  # the vehicle's thrust law
@@ -50,6 +55,10 @@ ARDUPILOT_VISION: Parameters = {
     "FS_GCS_ENABLE": 0,
     "DISARM_DELAY": 0,
 }
+ARDUPILOT_HALL: Parameters = {
+    "RTL_ALT": 500,  # centimetres
+    "LAND_ALT_LOW": 300,  # centimetres, above which it comes down at 1.5 m/s: blind, each second is drift
+}
 ARDUPILOT_SIMULATION: Parameters = {
     "FRAME_CLASS": 1,
     "FRAME_TYPE": 1,  # X: the vehicle's motor order
@@ -66,5 +75,5 @@ ARDUPILOT_SIMULATION: Parameters = {
     **{f"INS_ACC{n}SCAL_{axis}": 1.001 for n in ("", "2") for axis in "XYZ"},
 }  # fmt: skip
 
-PX4: Parameters = PX4_VISION | PX4_SIMULATION
-ARDUPILOT: Parameters = ARDUPILOT_VISION | ARDUPILOT_SIMULATION
+PX4: Parameters = PX4_VISION | PX4_HALL | PX4_SIMULATION
+ARDUPILOT: Parameters = ARDUPILOT_VISION | ARDUPILOT_HALL | ARDUPILOT_SIMULATION

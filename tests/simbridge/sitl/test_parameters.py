@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from companion.mavlink.manifest import MANIFESTS
 from simbridge.config import VehicleConfig
 from simbridge.sitl import parameters
 from tests.shared_data import shared_data
@@ -28,6 +29,14 @@ def test_every_name_is_one_that_the_real_autopilot_has(kind: str, ours: paramete
 def test_arducopter_gets_the_vision_parameters_it_was_recorded_with() -> None:
     real = recorded("ardupilot")
     assert {n: real[n] for n in parameters.ARDUPILOT_VISION} == pytest.approx(parameters.ARDUPILOT_VISION)
+
+
+@pytest.mark.parametrize(("kind", "ours"), [("px4", parameters.PX4), ("ardupilot", parameters.ARDUPILOT)])
+def test_the_doctor_has_nothing_against_them(kind: str, ours: parameters.Parameters) -> None:
+    values = recorded(kind) | ours
+    for expected in MANIFESTS[kind].parameters:
+        name = next(n for n in (expected.name, *expected.other_names) if n in values)
+        assert expected.is_met(values[name]) or not expected.applies(values), expected.why
 
 
 def test_the_thrust_law_told_to_px4_is_the_vehicles() -> None:
