@@ -17,6 +17,8 @@ GATE_M = 0.4
 ACCELERATION_MPS2 = 1.0  # 1 sigma of what a wheeled robot does between two scans
 TURN_MPS2 = 1.5  # the same of its heading, rad/s2
 MAX_ACCELERATION_MPS2 = 4.0
+MAX_SPEED_MPS = 10.0  # where nothing is known of the speed yet
+SLOW_MPS = 0.5
 MAX_TURN_RADPS2 = 6.0
 KEYFRAME_M = 0.15
 KEYFRAME_RAD = math.radians(5.0)
@@ -45,6 +47,7 @@ class PlanarMatcher:
         self._twist = np.zeros(3)  # m/s, m/s, rad/s in the scanner's frame
         self._t_ns: int | None = None
         self._keyframe = np.zeros(3)
+        self._is_speed_known = False  # at first the scanner may be under way already
 
     def match(self, points: Array, t_ns: int) -> Match:
         """points: (N, 2) in the scanner's frame, finite."""
@@ -62,14 +65,16 @@ class PlanarMatcher:
             self._twist[:] = 0.0
         guess = _moved(self._pose, self._twist * dt)
         found = self._register(points, guess, dt)
-        if found is None or not _is_plausible(found.pose, guess, dt):
+        if found is None or not _is_plausible(found.pose, guess, dt, is_speed_known=self._is_speed_known):
             self._pose = guess
             self._twist *= 0.5
+            self._is_speed_known = self._is_speed_known and bool(np.hypot(*self._twist[:2]) < SLOW_MPS)
             return Match(guess.copy(), False, 0)
         step = found.pose - self._pose
         step[:2] = rotation2(-self._pose[2]) @ step[:2]
         step[2] = wrap_angle(float(step[2]))
         self._twist = step / dt
+        self._is_speed_known = True
         self._pose = found.pose
         if self._is_new_place():
             self._insert(points)
@@ -80,6 +85,8 @@ class PlanarMatcher:
         if len(points) < MIN_POINTS:
             return None
         sigma = np.array([ACCELERATION_MPS2, ACCELERATION_MPS2, TURN_MPS2]) * dt * dt + np.array([0.02, 0.02, 0.01])
+        if not self._is_speed_known:
+            sigma += np.array([MAX_SPEED_MPS, MAX_SPEED_MPS, 0.0]) * dt
         best = self._try(points, guess, sigma)
         if best.matched_ratio < GOOD_RATIO:
             for turn in SEARCH_RAD:
@@ -103,10 +110,11 @@ class PlanarMatcher:
         self._walls.insert(placed, 0.0, np.zeros(3))
 
 
-def _is_plausible(pose: Array, guess: Array, dt: float) -> bool:
+def _is_plausible(pose: Array, guess: Array, dt: float, *, is_speed_known: bool) -> bool:
     """Whether a robot can have come there: no jumps, however well the walls seem to fit."""
     off = pose - guess
-    near = math.hypot(off[0], off[1]) <= 0.15 + MAX_ACCELERATION_MPS2 * dt * dt
+    reach = MAX_ACCELERATION_MPS2 * dt * dt if is_speed_known else MAX_SPEED_MPS * dt
+    near = math.hypot(off[0], off[1]) <= 0.15 + reach
     return near and abs(wrap_angle(float(off[2]))) <= 0.15 + MAX_TURN_RADPS2 * dt * dt
 
 
