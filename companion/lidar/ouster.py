@@ -125,6 +125,10 @@ class OusterDecoder:
         self._has_identity = profile != "LEGACY"  # and a checksum
         self._columns_per_packet = int(info.format.columns_per_packet)
         self._expected_packets = int(info.format.lidar_packets_per_frame())
+        self._packet_size = int(self._format.lidar_packet_size)
+        self._header_size = int(self._format.packet_header_size)
+        self._width = int(info.w)
+        self._max_frame_id = int(self._format.max_frame_id)
         self._period_ns = round(1e9 / (int(info.format.fps) * info.w))
         self._serial = int(info.sn or 0)
         self._init_id: int | None = None
@@ -132,8 +136,8 @@ class OusterDecoder:
         self._t_last_ns: int | None = None
         self._dtype = _packet_dtype(self._format, self._pixel, info.h, profile)
         slots = -(-info.w // self._columns_per_packet)
-        self._bytes = np.zeros((slots, self._format.lidar_packet_size), dtype=np.uint8)
-        self._received = np.zeros(slots, dtype=np.bool_)
+        self._packets: list[bytes] = [b""] * slots  # of the open frame; empty where none came yet
+        self._received = 0
         self._frame_id: int | None = None
         self._is_open = False
         self._is_restarted = False
@@ -151,12 +155,12 @@ class OusterDecoder:
             packet: UDP payload as it came. t_ns: companion time of its arrival. source: (host, port), if known.
         """
         self.packets += 1
-        if len(packet) != self._format.lidar_packet_size:
+        if len(packet) != self._packet_size:
             return self._drop("size")
         array = np.frombuffer(packet, dtype=np.uint8)
         kind, frame_id, init_id, serial = self._read_header(packet, array)
-        stamp, measurement = _COLUMN_START.unpack_from(packet, self._format.packet_header_size)
-        if kind != PACKET_TYPE_LIDAR or measurement >= self.info.w:
+        stamp, measurement = _COLUMN_START.unpack_from(packet, self._header_size)
+        if kind != PACKET_TYPE_LIDAR or measurement >= self._width:
             return self._drop("header")
         if self._has_identity and not self._is_sound(array):
             return self._drop("checksum")
@@ -164,7 +168,7 @@ class OusterDecoder:
             return self._drop("foreign")
         self._t_last_ns = t_ns
         self.clock.update(stamp + (self._columns_per_packet - 1) * self._period_ns, t_ns)
-        return self._place(array, frame_id, measurement // self._columns_per_packet)
+        return self._place(packet, frame_id, measurement // self._columns_per_packet)
 
     def _drop(self, reason: str) -> list[LidarScan]:
         self.dropped[reason] += 1
@@ -199,28 +203,29 @@ class OusterDecoder:
         self._host = host or self._host
         return True
 
-    def _place(self, array: NDArray[np.uint8], frame_id: int, slot: int) -> list[LidarScan]:
+    def _place(self, packet: bytes, frame_id: int, slot: int) -> list[LidarScan]:
         done: list[LidarScan] = []
         if frame_id != self._frame_id or self._is_restarted:
             if self._is_older(frame_id) and not self._is_restarted:
                 return self._drop("reordered")
             done += self._finish()
             self._frame_id = frame_id
-            self._received[:] = False
+            self._packets = [b""] * len(self._packets)
+            self._received = 0
             self._is_open, self._is_restarted = True, False
-        if self._received[slot] or not self._is_open:
+        if self._packets[slot] or not self._is_open:
             self.dropped["repeated"] += 1
             return done
-        self._bytes[slot] = array
-        self._received[slot] = True
-        if np.count_nonzero(self._received) >= self._expected_packets:
+        self._packets[slot] = packet
+        self._received += 1
+        if self._received >= self._expected_packets:
             done += self._finish()
         return done
 
     def _is_older(self, frame_id: int) -> bool:
         if self._frame_id is None:
             return False
-        behind = (self._frame_id - frame_id) % (int(self._format.max_frame_id) + 1)
+        behind = (self._frame_id - frame_id) % (self._max_frame_id + 1)
         return 0 < behind <= FRAMES_BACK
 
     def _finish(self) -> list[LidarScan]:
@@ -237,7 +242,7 @@ class OusterDecoder:
 
     def _decode(self, frame_id: int) -> LidarScan:
         rows, columns = self.info.h, self.info.w
-        column = self._bytes[self._received].view(self._dtype).reshape(-1)["column"].reshape(-1)
+        column = np.frombuffer(b"".join(self._packets), dtype=self._dtype)["column"].reshape(-1)
         measurement = column["measurement_id"].astype(np.intp)
         is_valid = ((column["status"] & 1) == 1) & (measurement < columns)
         measurement = measurement[is_valid]
