@@ -9,9 +9,34 @@ from numpy.typing import NDArray
 
 from companion.geometry import rpy_from_quat
 from companion.messages import Array, AttitudeSample
+from companion.odometry.jit import kernel
 
 HISTORY = 128  # samples; 2.5 s at 50 Hz
 MAX_EXTRAPOLATION_S = 0.1  # beyond the newest sample the turn rate is carried on for this long
+
+
+@kernel
+def _interpolate(
+    t_ns: NDArray[np.int64], sample_ns: NDArray[np.int64], values: Array, max_extrapolation_s: float
+) -> Array:
+    """Linear between the samples, the first and last ones before and after; yaw goes on at the last rate."""
+    newest = len(sample_ns) - 1
+    out = np.empty((len(t_ns), 4))
+    for i in range(len(t_ns)):
+        t = t_ns[i]
+        if t >= sample_ns[newest]:
+            out[i] = values[newest]
+            beyond_s = min(float(t - sample_ns[newest]) * 1e-9, max_extrapolation_s)
+            out[i, 2] += beyond_s * values[newest, 3]
+            continue
+        after = np.searchsorted(sample_ns, t, side="right")
+        if after == 0:
+            out[i] = values[0]
+            continue
+        past, span = float(t - sample_ns[after - 1]), float(sample_ns[after] - sample_ns[after - 1])
+        for k in range(4):
+            out[i, k] = (values[after, k] - values[after - 1, k]) / span * past + values[after - 1, k]
+    return out
 
 
 class AttitudeHistory(NamedTuple):
@@ -24,14 +49,7 @@ class AttitudeHistory(NamedTuple):
 
     def at(self, t_ns: NDArray[np.int64]) -> Array:
         """(M, 4) roll, pitch, gyro yaw, yaw rate at those times; carried on a little beyond the newest sample."""
-        out = np.empty((len(t_ns), 4))
-        base = self.t_ns[0]
-        x, xp = (t_ns - base).astype(np.float64), (self.t_ns - base).astype(np.float64)
-        for k in range(4):
-            out[:, k] = np.interp(x, xp, self.values[:, k])
-        beyond_s = np.clip((x - xp[-1]) * 1e-9, 0.0, MAX_EXTRAPOLATION_S)
-        out[:, 2] += beyond_s * self.values[-1, 3]
-        return out
+        return _interpolate(t_ns, self.t_ns, self.values, MAX_EXTRAPOLATION_S)
 
 
 class AttitudeBuffer:

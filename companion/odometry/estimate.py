@@ -14,6 +14,10 @@ from companion.odometry.filter import POSE, Planar, Vertical, carry, carry_verti
 TILT_SIGMA_RAD = 0.005  # of roll and pitch as the flight controller gives them
 
 
+_PLACE = np.ix_([0, 1, 5], [0, 1, 5])  # x, y, yaw in a pose's covariance
+_POSE_BLOCK = np.ix_(POSE, POSE)
+
+
 class Snapshot(NamedTuple):
     """Immutable state after a scan; map_variance: (4,) of the map itself where it was used, x, y, yaw, z."""
 
@@ -43,8 +47,7 @@ def estimate_at(snapshot: Snapshot, history: AttitudeHistory, t_ns: int, *, is_s
     r = matrix_from_quat(q)
     velocity_map = np.array([planar.x[2], planar.x[3], vertical.x[1]])
     covariance = np.zeros((6, 6))
-    at = np.ix_([0, 1, 5], [0, 1, 5])
-    covariance[at] = planar.p[np.ix_(POSE, POSE)] + np.diag(snapshot.map_variance[:3])
+    covariance[_PLACE] = planar.p[_POSE_BLOCK] + np.diag(snapshot.map_variance[:3])
     covariance[2, 2] = vertical.p[0, 0] + snapshot.map_variance[3]
     covariance[3, 3] = covariance[4, 4] = TILT_SIGMA_RAD**2
     velocity_covariance = np.zeros((3, 3))
