@@ -53,7 +53,7 @@ class Parameters:
     def next_deadline_ns(self, t_ns: int) -> int | None:
         if self._waiting and len(self._open) < _WINDOW:
             return t_ns
-        return min((t for _, t in self._open.values()), default=None)
+        return min(t for _, t in self._open.values()) if self._open else None
 
     def _request(self, name: str, tries: int, t_ns: int) -> None:
         self._open[name] = (tries + 1, t_ns + RETRY_NS)

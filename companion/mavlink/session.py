@@ -157,15 +157,18 @@ class MavlinkSession:
 
     def next_deadline_ns(self) -> int:
         """When `poll` has something to do next."""
-        deadlines = [self._heartbeats.t_next_ns]
-        if self._hearing.dialect is not None:
-            deadlines.append(self._hearing.timesync.t_next_ns)
-            if self._hearing.origin.state is not OriginState.CONFIRMED:
-                deadlines.append(self._hearing.origin.t_next_ns)
-            retry = self._commands.next_deadline_ns()
-            again = self._parameters.next_deadline_ns(self._journal.t_ns)
-            deadlines.extend(t for t in (retry, again) if t is not None)
-        return min(deadlines)
+        hearing = self._hearing
+        deadline = self._heartbeats.t_next_ns
+        if hearing.dialect is None:
+            return deadline
+        deadline = min(deadline, hearing.timesync.t_next_ns)
+        if hearing.origin.state is not OriginState.CONFIRMED:
+            deadline = min(deadline, hearing.origin.t_next_ns)
+        retry = self._commands.next_deadline_ns()
+        if retry is not None:
+            deadline = min(deadline, retry)
+        again = self._parameters.next_deadline_ns(self._journal.t_ns)
+        return deadline if again is None else min(deadline, again)
 
     def take_events(self) -> list[Event]:
         """Events that no `receive` has brought out yet: when the link is silent there is none."""
