@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 
 BOOT_NS = 1_000_000_000
 CLEARANCE_PERIOD_NS = 40_000_000
+CLEARANCE_SLACK_M = 0.5  # by which clearance from a pile may fall short at once: it is told from its corners
 HARD_LANDING_MPS = 1.5  # PX4 lands at 0.7
 LIFTOFF_M = 0.3
 TOPPLED_COS = math.cos(math.radians(50.0))
@@ -79,6 +80,7 @@ class Simulation:
         self._lidar = Lidar(self.world.model, v.data, v.body_id, cfg.lidar, cfg.seed, BOOT_NS, step_ns)
         self._faults = SensorFaults(cfg.faults, cfg.seed, BOOT_NS)
         self._packets: list[bytes] = []
+        self._clearance_m, self._clearance_place = -math.inf, v.position.copy()  # where it was last computed
 
     def step(self) -> None:
         """4 ms: what the sensors measured goes to the flight controller, its motor commands move the vehicle."""
@@ -147,14 +149,23 @@ class Simulation:
         if self._faults.liftoff_ns is None and float(vehicle.position[2]) > self._ground_z + LIFTOFF_M:
             self._faults.liftoff_ns = self.t_ns
         if self.t_ns % CLEARANCE_PERIOD_NS < self._step_ns:
-            clearance = self.world.clearance(vehicle.position) - fp.VEHICLE_RADIUS_M
-            self.min_clearance_m = min(self.min_clearance_m, clearance)
+            self._note_clearance()
         if self.collision or not vehicle.has_contact:
             return
         if vehicle.touches_store:
             self.collision = True
         elif float(velocity_before[2]) < -HARD_LANDING_MPS or vehicle.up_cos < TOPPLED_COS:
             self.collision = True  # on the ground, but not as one lands
+
+    def _note_clearance(self) -> None:
+        """Computed only where it can be the smallest yet: it changes no faster than the vehicle moves."""
+        position = self._vehicle.position
+        moved_m = math.dist(position, self._clearance_place)
+        if self._clearance_m - moved_m - CLEARANCE_SLACK_M > self.min_clearance_m:
+            return
+        self._clearance_m = self.world.clearance(position) - fp.VEHICLE_RADIUS_M
+        self._clearance_place = position.copy()
+        self.min_clearance_m = min(self.min_clearance_m, self._clearance_m)
 
 
 def start_pose(cfg: SimConfig) -> tuple[float, float, float]:
