@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from pydantic import ValidationError
 from companion.config import CompanionConfig
 from companion.errors import ConfigError, FileFormatError
 from companion.flight import Flight
+from companion.mapping.export import save_point_map
 from companion.messages import OdometryEstimate, VolumeReport
 from companion.odometry import ScanResult
 from companion.recording.manifest import require_unaltered
@@ -114,11 +117,13 @@ def replay_command(
     Exit codes: 0 all well (with --diff: no difference), 1 --diff found differences, 2 not a recording, or altered.
     """
     again = replay_run(run, settings or (), keep_messages=diff)
-    volume = again.flight.measure() if report or out is not None else None
+    folder = recording_path(run).parent
+    left = left_behind(folder) if diff else {}
+    volume = again.flight.measure() if report or out is not None or "volume_m3" in left else None
     said = summary(again, volume)
     differences: list[TopicDifference] = []
     if diff:
-        differences = compare(again.recording.topics, again.replay)
+        differences = [*compare(again.recording.topics, again.replay), *compare_results(left, again, volume)]
         said["differences"] = [
             {"topic": d.name, "recorded": d.recorded, "replayed": d.replayed, "first": d.first} for d in differences
         ]
@@ -127,6 +132,35 @@ def replay_command(
         write_results(out, again, said)
     typer.echo(json.dumps(said, indent=2) if as_json else describe(said))
     raise typer.Exit(EXIT_DIFFERENT if any(d.first for d in differences) else 0)
+
+
+def left_behind(folder: Path) -> dict[str, Any]:
+    """What a run wrote of its map and volume: map.ply's bytes, volume_m3 of report.json; what is not there is left out."""
+    found: dict[str, Any] = {}
+    if (folder / "map.ply").is_file():
+        found["map.ply"] = (folder / "map.ply").read_bytes()
+    with contextlib.suppress(OSError, ValueError):
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        if isinstance(report.get("volume_m3"), float):
+            found["volume_m3"] = report["volume_m3"]
+    return found
+
+
+def compare_results(left: dict[str, Any], again: Replayed, volume: VolumeReport | None) -> list[TopicDifference]:
+    """Map and volume against what the run left behind."""
+    found: list[TopicDifference] = []
+    if "map.ply" in left:
+        with tempfile.TemporaryDirectory() as temporary:
+            path = Path(temporary) / "map.ply"
+            save_point_map(again.flight.mapper.point_map(), path)
+            data = path.read_bytes()
+        first = None if data == left["map.ply"] else f"{len(left['map.ply'])} bytes, now {len(data)} others"
+        found.append(TopicDifference("map.ply", 1, 1, first))
+    if "volume_m3" in left and volume is not None:
+        same = volume.volume_m3 == left["volume_m3"]
+        first = None if same else f"{left['volume_m3']!r} m3, now {volume.volume_m3!r}"
+        found.append(TopicDifference("report.json volume_m3", 1, 1, first))
+    return found
 
 
 def summary(again: Replayed, volume: VolumeReport | None = None) -> dict[str, Any]:
@@ -165,8 +199,6 @@ def summary(again: Replayed, volume: VolumeReport | None = None) -> dict[str, An
 
 
 def write_results(folder: Path, again: Replayed, said: dict[str, Any]) -> None:
-    from companion.mapping.export import save_point_map
-
     folder.mkdir(parents=True, exist_ok=True)
     save_point_map(again.flight.mapper.point_map(), folder / "map.ply")
     (folder / "trajectory.tum").write_text("".join(tum_line(e) for e in again.estimates), encoding="utf-8")
