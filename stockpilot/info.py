@@ -21,6 +21,7 @@ from stockpilot.scan_files import carmen_lines, metadata_beside, open_bag
 
 GAP_FACTOR = 5.0  # a gap this many times the usual interval of a steady stream is told
 GAP_LEAST_NS = 500_000_000
+STOP_AND_GO = ("navigator/setpoint", "guard/setpoint")  # steady only while the companion is in control
 
 
 @dataclass(slots=True)
@@ -48,7 +49,7 @@ class Stream:
             "bytes": self.size,
             "rate_hz": round((len(times) - 1) / span_s, 3) if span_s > 0 else None,
             "longest_gap_s": None if longest_s is None else round(longest_s, 6),
-            "has_gap": _has_gap(steps),
+            "has_gap": self.name not in STOP_AND_GO and _has_gap(steps),
         }
 
 
