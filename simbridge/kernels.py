@@ -225,5 +225,5 @@ def warm_up() -> None:
     nearest_obstacle(np.zeros((1, 9)), 0.0, 0.0, 0.0)
     returns(
         np.ones(1), np.ones(3), np.ones(3), np.zeros((1, 3)), np.zeros((1, 1)), np.zeros((1, 1, 3)), np.zeros(8),
-        np.zeros(1, dtype=np.int64), 0, np.zeros((1, 16), dtype=np.uint32), np.zeros((1, 16), dtype=np.uint16),
+        np.zeros(1, dtype=np.int64), 0, np.zeros((16, 2), dtype=np.uint32)[:, :1].T, np.zeros((16, 2), dtype=np.uint16)[:, :1].T,
     )  # fmt: skip

@@ -51,6 +51,7 @@ class Lidar:
         self._rays, self._normals = np.zeros(3 * most * len(self._rows)), np.zeros(3 * most * len(self._rows))
         self._distance = np.zeros(most * len(self._rows))
         self._geom = np.zeros(most * len(self._rows), dtype=np.int32)
+        self._within = np.arange(COLUMNS_PER_PACKET)
         self._next = 0  # column, counted from the first one
 
     @property
@@ -132,7 +133,7 @@ class Lidar:
         )  # fmt: skip
 
     def _pack(self, column: int) -> bytes:
-        t_ns = self._t_ns(np.arange(column, column + COLUMNS_PER_PACKET)) + self._clock_offset_ns
+        t_ns = self._t_ns(column + self._within) + self._clock_offset_ns
         turn, first = divmod(column, self._columns)
         return self._writer.pack(turn, first, t_ns)
 

@@ -24,7 +24,6 @@ SENSOR_ABOVE_BASE_M = 0.03618  # origin of the lidar frame above that of the sen
 SERIAL = 992100000000
 INIT_ID = 1
 ALBEDO = 40
-RANGE_MASK = np.uint32(0x7FFFF)  # 19 bits
 UDP_PORT_LIDAR = 7502  # Ouster's own
 
 
@@ -71,21 +70,21 @@ def directions_sensor(cfg: LidarSimConfig) -> Array:
 class PacketWriter:
     """Lidar packets of COLUMNS_PER_PACKET columns each, as they are measured.
 
-    Fill range_mm (rows, 16) uint32 and signal (rows, 16) uint16 and call `pack`. ouster-sdk packs whole frames only, and
-    slowly: this has it pack one packet, and then overwrites in that what changes (a test packs the same by the SDK).
+    Fill range_mm (rows, 16) uint32, below 2^19, and signal (rows, 16) uint16 and call `pack`. ouster-sdk packs whole
+    frames only, and slowly: this has it pack one packet, whose changing parts are then overwritten in place (a test
+    packs the same by the SDK).
     """
 
     def __init__(self, cfg: LidarSimConfig) -> None:
         self._format = core.PacketFormat(sensor_info(cfg))
         self._max_frame_id = int(self._format.max_frame_id)
-        self.range_mm: NDArray[np.uint32] = np.zeros((cfg.rows, COLUMNS_PER_PACKET), dtype=np.uint32)
-        self.signal: NDArray[np.uint16] = np.zeros((cfg.rows, COLUMNS_PER_PACKET), dtype=np.uint16)
         self._bytes: NDArray[np.uint8] = _template(cfg, self._format)
         packet = self._bytes.view(_packet_type(cfg.rows, self._format))  # (1,)
         self._frame_id, self._crc = packet["frame_id"], packet["crc"]
         column = packet["column"][0]
         self._stamp, self._measurement = column["stamp"], column["measurement_id"]
-        self._range, self._signal = column["pixel"]["range"], column["pixel"]["signal"]
+        self.range_mm: NDArray[np.uint32] = column["pixel"]["range"].T
+        self.signal: NDArray[np.uint16] = column["pixel"]["signal"].T
         self._offsets = np.arange(COLUMNS_PER_PACKET, dtype=np.uint16)
 
     def pack(self, frame_id: int, first_column: int, t_sensor_ns: NDArray[np.int64]) -> bytes:
@@ -93,8 +92,6 @@ class PacketWriter:
         self._frame_id[0] = frame_id % (self._max_frame_id + 1)
         self._stamp[:] = t_sensor_ns
         self._measurement[:] = self._offsets + np.uint16(first_column)
-        self._range[:] = self.range_mm.T & RANGE_MASK
-        self._signal[:] = self.signal.T
         self._crc[0] = self._format.calculate_crc(self._bytes)
         return self._bytes.tobytes()
 
