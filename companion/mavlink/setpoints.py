@@ -44,15 +44,19 @@ def pack_setpoint(setpoint: Setpoint, target_system: int, time_boot_ms: int) -> 
     )
 
 
+_BEARINGS = tuple(
+    tuple((k - _BEAMS_PER_SECTOR * sector - _BEAMS_PER_SECTOR // 2) % 360 for k in range(_BEAMS_PER_SECTOR))
+    for sector in range(SECTORS)
+)
+
+
 def pack_obstacles(ranges: WallRanges, *, min_range_m: float, max_range_m: float) -> bytes:
     """OBSTACLE_DISTANCE: 72 sectors of 5 degrees clockwise from forward, cm, BODY_FRD. Each is centred on its bearing
     and holds the nearest return; max + 1 where nothing was within reach, 65535 where nothing was seen."""
     max_cm = min(int(max_range_m * 100), 65533)
     metres, seen = ranges.ranges_m.tolist(), ranges.is_seen.tolist()
     distances = []
-    for sector in range(SECTORS):
-        first = -_BEAMS_PER_SECTOR * sector - _BEAMS_PER_SECTOR // 2
-        bearings = [(first + k) % 360 for k in range(_BEAMS_PER_SECTOR)]
+    for bearings in _BEARINGS:
         looked = [metres[b] for b in bearings if seen[b]]
         nearest = min(looked, default=None)
         if nearest is None or math.isnan(nearest):

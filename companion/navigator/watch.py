@@ -85,12 +85,12 @@ class VisionWatch:
             return "the estimate is old"
         if t_ns - walls.t_ns > limit:
             return "the scan is old"
-        if not np.all(np.isfinite(estimate.position_map_m)) or not np.all(np.isfinite(estimate.q_map_body_wxyz)):
+        if not all(map(math.isfinite, (*estimate.position_map_m.tolist(), *estimate.q_map_body_wxyz.tolist()))):
             return "the estimate is not finite"
         if estimate.quality < 0:
             return "registration failed"
-        variances = estimate.pose_covariance[[0, 1], [0, 1]]
-        if not np.all((variances >= 0) & (variances <= self._guard.max_position_sigma_m**2)):
+        largest, covariance = self._guard.max_position_sigma_m**2, estimate.pose_covariance
+        if not (0.0 <= covariance[0, 0] <= largest and 0.0 <= covariance[1, 1] <= largest):
             return UNCERTAIN
         return ""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,7 @@ class AttitudeBuffer:
     def add(self, sample: AttitudeSample) -> bool:
         """False when the sample is not finite, not a rotation, or not newer than the last (counted)."""
         q, rate = np.asarray(sample.q_ref_body_wxyz, float), np.asarray(sample.rate_body_radps, float)
-        if q.shape != (4,) or rate.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(rate).all():
+        if q.shape != (4,) or rate.shape != (3,) or not all(map(math.isfinite, (*q.tolist(), *rate.tolist()))):
             self.dropped += 1
             return False
         norm = float(q @ q)
