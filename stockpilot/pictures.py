@@ -25,7 +25,6 @@ BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION, GREY = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#8A8A8A",
 )  # fmt: skip
 HEIGHT_COLOURS = "viridis"
-MAX_DRAWN_POINTS = 250_000
 STYLE: Any = {
     "font.size": 10,
     "axes.titlesize": 11,
@@ -89,7 +88,6 @@ def draw_trajectory(
 def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by height") -> Path:
     """The point map from above and from the side, coloured by height in `map`."""
     points = point_map.points_map
-    points = points[:: max(1, len(points) // MAX_DRAWN_POINTS)]
     with plt.rc_context(STYLE):
         if len(points) == 0:
             figure, axes = plt.subplots(figsize=(6, 3))
@@ -102,7 +100,7 @@ def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by 
         tall = float(np.clip(width * span[1] / span[0], 2.5, 9.0))
         flat = float(np.clip(width * span[2] / span[0], 1.0, 3.0))
         figure, (plan, side) = plt.subplots(2, 1, figsize=(width, tall + flat + 1.4), height_ratios=[tall, flat])
-        picture, extent = _from_above(point_map.points_map, low, high)
+        picture, extent = _binned(points, low, high)
         shown: Any = {"cmap": HEIGHT_COLOURS, "vmin": low[2], "vmax": high[2]}
         dots = plan.imshow(picture, extent=extent, origin="lower", interpolation="nearest", **shown)
         plan.grid(visible=False)
@@ -111,9 +109,10 @@ def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by 
             plan.legend(loc="upper right", frameon=True, framealpha=0.9, fontsize=9)
         _plan(plan, [np.vstack([low[:2], high[:2]])], "map")
         plan.set_title(f"{title} ({len(point_map.points_map):,} points)", loc="left")
-        side.scatter(
-            points[:, 0], points[:, 2], c=points[:, 2], s=0.2, lw=0, alpha=0.5, rasterized=True, **shown
-        )  # fmt: skip
+        upright = [0, 2, 2]  # x to the right, z up, z the colour
+        picture, extent = _binned(points[:, upright], low[upright], high[upright])
+        side.imshow(picture, extent=extent, origin="lower", interpolation="nearest", **shown)
+        side.grid(visible=False)
         side.set_xlim(plan.get_xlim())
         side.set_ylim(low[2] - 0.5, high[2] + 0.7)
         side.set_aspect("equal", adjustable="box")
@@ -123,8 +122,8 @@ def draw_map(path: Path, point_map: PointMap, *, title: str = "Map, coloured by 
         return _save(figure, path)
 
 
-def _from_above(points: Array, low: Array, high: Array) -> tuple[Array, tuple[float, float, float, float]]:
-    """Mean height by pixel, NaN where nothing was returned, and (left, right, bottom, top) of the picture."""
+def _binned(points: Array, low: Array, high: Array) -> tuple[Array, tuple[float, float, float, float]]:
+    """Mean of the third column by pixel of the first two, NaN where nothing was returned, and (left, right, bottom, top)."""
     pixel = max(float((high - low)[:2].max()) / 330, 0.02)
     shape = tuple(int(n) + 1 for n in np.ceil((high - low)[1::-1] / pixel + 6))
     column, row = (np.floor((points[:, i] - low[i]) / pixel).astype(np.int64) + 3 for i in (0, 1))
