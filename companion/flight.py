@@ -158,6 +158,7 @@ class Flight:
         self.walls = result.wall_ranges
         self.session.send_wall_ranges(result.wall_ranges)
         self.tap(topics.WALLS, t_ns, result.wall_ranges)
+        self.tap(topics.LEVELLED, t_ns, result.levelled)
         if estimate.is_keyframe:
             self.keyframes.append(estimate)
             self.tap(topics.KEYFRAME, t_ns, estimate)

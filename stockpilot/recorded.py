@@ -11,7 +11,9 @@ from typing import Self
 import yaml
 
 from companion.flight import Flight
+from companion.messages import LevelledScan
 from companion.recording.log import Recorder
+from companion.topics import Topic
 from stockpilot.lockstep import Lockstep
 from stockpilot.mission import Mission
 
@@ -38,8 +40,16 @@ def open_recorder(
 
 def listen(recorder: Recorder, flight: Flight) -> None:
     """From now on the recorder hears all that this flight hears and says."""
+
+    def tap(topic: Topic, t_ns: int, message: object) -> None:
+        if isinstance(message, LevelledScan):
+            if flight.estimate is not None:
+                recorder.points(message, flight.estimate)
+        else:
+            recorder.tap(topic, t_ns, message)
+
     flight.record = recorder.input
-    flight.tap = recorder.tap
+    flight.tap = tap
 
 
 def commit() -> str:
@@ -62,8 +72,10 @@ class LockstepRecorder:
         self._mission = mission
         self._autopilot = autopilot
         self._recorder: Recorder | None = None
+        self._runner: Lockstep | None = None
 
     def attach(self, runner: Lockstep) -> None:
+        self._runner = runner
         self._recorder = open_recorder(
             self._folder, self._mission, lidar_metadata_json=runner.flight.lidar_metadata_json,
             autopilot=self._autopilot, threaded=False,
@@ -77,6 +89,10 @@ class LockstepRecorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._recorder is not None:
-            outcome = {"state": "interrupted" if error is not None else "ended"}
-            self._recorder.close(outcome)
+        if self._recorder is None or self._runner is None:
+            return
+        navigation = self._runner.flight.navigation
+        if error is not None or navigation is None:
+            self._recorder.close({"state": "interrupted", "reason": "" if error is None else str(error)})
+        else:
+            self._recorder.close({"state": navigation.outcome or "ended", "reason": navigation.reason})
