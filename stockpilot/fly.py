@@ -25,6 +25,7 @@ from companion.recording.log import Recorder
 from companion.recording.manifest import write_manifest
 from companion.telemetry.mqtt import Telemetry
 from companion.topics import EVENT, Topic
+from companion.warm_up import warm_up
 from stockpilot.leave import write_trajectory
 from stockpilot.mission import Mission, load_mission
 from stockpilot.recorded import listen, open_recorder
@@ -58,6 +59,8 @@ def fly_command(
     spool = folder / "mqtt"
     if mission.companion.telemetry.mqtt_url is not None:
         app.telemetry = mqtt_task(mqtt_telemetry(mission.companion.telemetry, flight, spool), flight)
+    console.print("warming up (half a minute the first time on a computer) ...", style="dim")
+    warm_up(mission.companion)
     began = time.monotonic()
     try:
         asyncio.run(
