@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import shutil
 import signal
@@ -18,6 +19,7 @@ from simbridge.sitl import SitlError
 
 STOP_GRACE_S = 3.0
 LOG_TAIL_LINES = 15
+PR_SET_PDEATHSIG = 1  # prctl(2)
 ARDUPILOT_RATE_HZ = 800
 UNPACED_SPEEDUP = 1000  # ArduCopter never waits for wall time: the physics does, where a flight is paced
 
@@ -140,11 +142,17 @@ def _fresh_folder(folder: Path | None) -> tuple[Path, bool]:
     return folder.resolve(), False
 
 
+def _die_with_parent() -> None:
+    """Linux: an autopilot left over would hold its ports, and the next one would not start."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
 def _start(command: list[str], folder: Path, owned: bool, environment: dict[str, str]) -> AutopilotProcess:
     log_path = folder / "autopilot.txt"
     with log_path.open("wb") as log:
         process = subprocess.Popen(
             command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-            start_new_session=True,
+            start_new_session=True, preexec_fn=_die_with_parent,
         )  # fmt: skip
     return AutopilotProcess(process=process, folder=folder, log_path=log_path, owns_folder=owned, name=command[0])

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import stat
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -20,6 +22,13 @@ def script(path: Path, text: str) -> Path:
 def px4_build(tmp_path: Path, text: str) -> Path:
     (tmp_path / "build" / "etc" / "init.d-posix").mkdir(parents=True)
     return script(tmp_path / "build" / "bin" / "px4", text)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())  # of one that has ended: empty, then gone
+    except FileNotFoundError:
+        return False
 
 
 def log_of(process: AutopilotProcess, until: str) -> str:
@@ -62,6 +71,25 @@ def test_one_that_ignores_the_signal_is_ended_all_the_same(tmp_path: Path, monke
     log_of(process, "ready")
     process.stop()
     assert not process.is_running
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asked of the Linux kernel")
+def test_one_whose_simulation_is_killed_ends_too(tmp_path: Path) -> None:
+    """Left over it would hold its ports, and the next flight would not start."""
+    binary = px4_build(tmp_path, "sleep 60")
+    program = (
+        "from pathlib import Path; from simbridge.sitl.process import start_px4\n"
+        f"p = start_px4(Path({str(binary)!r}), {{}}); print(p.process.pid, flush=True); p.process.wait()"
+    )
+    simulation = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+    assert simulation.stdout is not None
+    pid = int(simulation.stdout.readline())
+    simulation.kill()
+    simulation.communicate()
+    deadline = time.monotonic() + 5.0
+    while is_running(pid):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def test_one_that_ends_by_itself_is_told_with_the_end_of_its_log(tmp_path: Path) -> None:
