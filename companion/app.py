@@ -41,6 +41,8 @@ class App:
     scans_dropped: int = 0
     scans_unmapped: int = 0
     restarts: dict[str, int] = field(default_factory=dict)
+    give_up_s: float = 10.0  # after an abort without a flight controller
+    _aborted_ns: int | None = None
     cadence: Cadence = field(default_factory=Cadence)
     _scans: deque[LidarScan] = field(default_factory=lambda: deque(maxlen=SCAN_QUEUE))
     _scan_ready: asyncio.Event = field(default_factory=asyncio.Event)
@@ -80,8 +82,9 @@ class App:
         self._drain_map()
 
     def abort(self, source: str) -> None:
-        """Latched: zero velocity, then land."""
+        """Latched: zero velocity, then land. Where no flight controller is heard any more there is nothing to land."""
         now = time.monotonic_ns()
+        self._aborted_ns = self._aborted_ns or now
         self.flight.on_operator(OperatorCommand(t_ns=now, kind=OperatorCommandKind.ABORT, source=source))
 
     async def supervise(self, name: str, task: Callable[[], Awaitable[None]]) -> None:
@@ -112,7 +115,15 @@ class App:
             self.flight.poll(now_ns)
             self._send()
             if self.flight.is_finished and finished_ns is None:
-                finished_ns = time.monotonic_ns()
+                finished_ns = now_ns
+            if self._is_in_vain(now_ns):
+                return
+
+    def _is_in_vain(self, now_ns: int) -> bool:
+        """Aborted, and for a while no flight controller was heard that could be landed."""
+        if self._aborted_ns is None or now_ns - self._aborted_ns < self.give_up_s * 1e9:
+            return False
+        return not self.flight.session.vehicle_state(now_ns).is_connected
 
     async def _receive_mavlink(self, link: MavlinkLink) -> None:
         while True:

@@ -50,8 +50,8 @@ def test_two_programs_fly_and_sigterm_lands_with_everything_recorded(tmp_path: P
             "fly", str(mission), "--connect", f"udpin://127.0.0.1:{mavlink}", "--lidar", f"udp://127.0.0.1:{lidar}",
             "--lidar-metadata", str(tmp_path / "lidar.json"), "--out", str(out), "--json",
         )  # fmt: skip
+        said = Listener(companion)
         try:
-            said = Listener(companion)
             assert said.hears("climb", UNTIL_CLIMB_S), said.text()
             time.sleep(3.0)
             companion.send_signal(signal.SIGTERM)
@@ -61,6 +61,7 @@ def test_two_programs_fly_and_sigterm_lands_with_everything_recorded(tmp_path: P
         finally:
             companion.kill()
             companion.wait()
+            said.close()
     finally:
         world.send_signal(signal.SIGTERM)
         world_said, world_errors = world.communicate(timeout=60)
@@ -90,6 +91,13 @@ class Listener:
                 return False
             time.sleep(0.1)
         return False
+
+    def close(self) -> None:
+        """Once the program has ended: nothing stays open."""
+        self._thread.join()
+        for pipe in (self._program.stdout, self._program.stderr):
+            if pipe is not None:
+                pipe.close()
 
     def text(self) -> str:
         return "".join(self._lines)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -28,9 +27,9 @@ def free_ports(count: int) -> list[int]:
 
 
 @pytest.fixture
-def app() -> Iterator[App]:
+def app() -> App:
     link, lidar = free_ports(2)
-    yield App(Flight(CompanionConfig()), connect=f"udpin://127.0.0.1:{link}", lidar=f"udp://127.0.0.1:{lidar}")
+    return App(Flight(CompanionConfig()), connect=f"udpin://127.0.0.1:{link}", lidar=f"udp://127.0.0.1:{lidar}")
 
 
 def events_of(app: App) -> list[Event]:
@@ -111,3 +110,12 @@ async def test_sigterm_reaches_the_flight_as_an_abort(app: App) -> None:
     app.flight.record = lambda kind, t_ns, payload, source: heard.append(payload) if kind == "operator" else None
     app.abort("sigterm")
     assert heard == [b"abort sigterm"]
+
+
+async def test_abort_without_a_flight_controller_ends_the_program(app: App) -> None:
+    """Nothing can be landed: it must not wait for ever."""
+    app.give_up_s = 0.3
+    running = asyncio.create_task(app.run())
+    await asyncio.sleep(0.1)
+    app.abort("sigint")
+    await asyncio.wait_for(running, 5.0)
