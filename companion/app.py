@@ -109,7 +109,7 @@ class App:
             deadline_ns = self.flight.next_deadline_ns()
             await asyncio.sleep(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9))
             now_ns = time.monotonic_ns()
-            overloaded = self.cadence.lag(now_ns, now_ns - deadline_ns)
+            overloaded = self.cadence.lag(now_ns, now_ns - deadline_ns) if deadline_ns > 0 else None
             if overloaded is not None:
                 self.flight.on_event(overloaded)
             self.flight.poll(now_ns)
