@@ -26,8 +26,9 @@ from companion.messages import (
     WallRanges,
 )
 from companion.odometry import filter as kalman
+from companion.odometry import weak
 from companion.odometry.attitude import AttitudeBuffer, AttitudeHistory
-from companion.odometry.degeneracy import Judgement, judge
+from companion.odometry.degeneracy import Judgement, judge, weak_direction
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
 from companion.odometry.level import Leveller, block_means
@@ -96,6 +97,8 @@ class Odometry:
         self._sigma_range_m = 0.1
         self._accepted = 0
         self._usual_share = 0.0  # of the layer's points that found a wall, lately
+        self._is_weak, self._is_lost = False, False  # along an axis: not held by walls; nor known well enough to map
+        self._held_by_walls = np.zeros((2, 2))  # translation's information while weak, over some scans
         self._rejected_in_row = 0
         self._keyframe_t_ns = 0
         self._keyframe_z_m = 0.0
@@ -153,17 +156,17 @@ class Odometry:
             snapshot = self._first(scan, planar, vertical)
             ground = self.height.fit(lower, planar, vertical, self.walls, self._sigma_range_m).new_ground
         else:
-            planar, registration, judgement, reset = self._place(planar, layer, float(vertical.x[0]))
+            planar, registration, judgement, reset = self._place(planar, layer, float(vertical.x[0]), old.t_scan_ns)
             self.height.is_standing = self._standstill.is_standing
             vertical, fit = self.height.update(lower, planar, vertical, history, self.walls, self._sigma_range_m)
             ground = fit.new_ground
             if not self._is_released:
                 planar, vertical = self._stand(
-                    history, planar, vertical, registration, fit.correction[0], fit.z_sigma_m
+                    history, planar, vertical, registration, judgement, fit.correction[0], fit.z_sigma_m
                 )
             snapshot = self._after(old, scan, planar, vertical, registration, judgement, reset)
         variance = np.append(np.diag(planar.p)[kalman.POSE], vertical.p[0, 0]) + snapshot.map_variance
-        if judgement is None or judgement.is_accepted:
+        if judgement is None or (judgement.is_accepted and not self._is_lost):
             self._pending.append(_Pending(layer, ground, planar.x[kalman.POSE], float(vertical.x[0]), variance))
             del self._pending[:-MAX_PENDING]
         if snapshot.is_keyframe:
@@ -214,7 +217,7 @@ class Odometry:
         )
 
     def _place(
-        self, planar: kalman.Planar, layer: Array, z_m: float
+        self, planar: kalman.Planar, layer: Array, z_m: float, before_ns: int
     ) -> tuple[kalman.Planar, Registration, Judgement, bool]:
         """Register the layer from the predicted pose; fuse it if it can be believed; search if it failed for long."""
         guess = planar.x[kalman.POSE]
@@ -222,22 +225,68 @@ class Odometry:
         prior = np.asarray(np.linalg.inv(covariance + np.diag(PRIOR_SIGMA**2)), np.float64)
         registration = self.walls.register(layer, guess, prior, z_m=z_m, sigma_range_m=self._sigma_range_m)
         judgement = judge(registration, guess, covariance, len(layer))
-        if judgement.is_accepted and self._is_misplaced(registration, layer, guess, covariance, z_m):
+        may_jump = judgement.is_accepted and not self._is_lost
+        if may_jump and self._is_misplaced(registration, layer, guess, covariance, z_m):
             judgement = replace(judgement, refused_because="fits better elsewhere")
+        if self._is_lost or (judgement.is_degenerate and judgement.is_accepted):
+            axis = self._weak_axis(planar, registration, judgement)
+            return self._place_weakly(planar, layer, z_m, prior, axis, before_ns)
         if judgement.is_accepted:
             self._rejected_in_row = 0
             self._accepted += 1
             self._track_noise(registration.scale)
             seen, apparent = registration.information, registration.apparent_information
             planar = kalman.update(planar, registration.pose, seen, apparent, prior, FLOOR_SIGMA**2)
-            return planar, registration, judgement, False
+            was_weak, self._is_weak = self._is_weak, False
+            return planar, registration, judgement, was_weak and _is_jump(planar.x, guess)
         self._rejected_in_row += 1
         self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
         if self._rejected_in_row >= FAILED_AFTER:
             found = relocalise(self.walls, layer, guess, covariance, z_m, self._sigma_range_m)
-            if found is not None:
+            anew = judge(found, found.pose, covariance, len(layer)) if found is not None else judgement
+            if found is not None and not anew.is_degenerate:
                 self._rejected_in_row = 0
-                return kalman.restart(planar, found.pose), found, judge(found, found.pose, covariance, len(layer)), True
+                return kalman.restart(planar, found.pose), found, anew, True
+        return planar, registration, judgement, False
+
+    def _weak_axis(self, planar: kalman.Planar, registration: Registration, judgement: Judgement) -> Array:
+        """(2,) in map; over some scans: were it to turn with each, what each leaves of it would add up."""
+        if not judgement.is_degenerate:
+            return weak.widest_axis(planar)
+        memory = weak.AXIS_MEMORY if self._is_weak else 0.0
+        self._held_by_walls = memory * self._held_by_walls + registration.information[:2, :2]
+        return weak_direction(self._held_by_walls)[1]
+
+    def _place_weakly(
+        self, planar: kalman.Planar, layer: Array, z_m: float, prior: Array, axis: Array, before_ns: int
+    ) -> tuple[kalman.Planar, Registration, Judgement, bool]:
+        """Register across the weak axis only; search along it once the position there is lost and walls are missing."""
+        guess = planar.x[kalman.POSE]
+        covariance = planar.p[np.ix_(kalman.POSE, kalman.POSE)]
+        planar = weak.settle(planar, axis, (planar.t_ns - before_ns) * 1e-9)
+        noise, prior_held = self._sigma_range_m, weak.held(prior, axis)
+        registration = self.walls.register(layer, guess, prior_held, z_m=z_m, sigma_range_m=noise)
+        judgement = judge(registration, guess, covariance, len(layer))
+        sigma_m = weak.sigma_along(planar, axis)
+        is_missing = registration.inliers < (1.0 - weak.MISSING_RATIO) * len(layer)
+        if self._is_lost and (is_missing or not judgement.is_degenerate):
+            found = weak.find_along(self.walls, layer, guess, axis, sigma_m, z_m, noise)
+            if found is not None:
+                self._rejected_in_row, self._is_weak, self._is_lost = 0, False, False
+                judgement = judge(found, found.pose, covariance, len(layer))
+                return weak.found_again(planar, found.pose), found, judgement, _is_jump(found.pose, guess)
+        judgement = replace(judgement, is_degenerate=True, weak_axis=axis)
+        if judgement.is_accepted:
+            self._rejected_in_row = 0
+            self._accepted += 1
+            self._track_noise(registration.scale)
+            seen, apparent = weak.without_axis(registration, axis)
+            floor = FLOOR_SIGMA**2 + weak.axis_variance(sigma_m)
+            planar = kalman.update(planar, registration.pose, seen, apparent, prior, floor)
+        else:
+            self._rejected_in_row += 1
+            self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
+        self._is_weak, self._is_lost = True, weak.sigma_along(planar, axis) > weak.LOST_M
         return planar, registration, judgement, False
 
     def _is_misplaced(
@@ -256,7 +305,7 @@ class Odometry:
         if found is None or found.inliers < registration.inliers + SUDDEN_LOSS * len(layer):
             return False
         self._usual_share = max(self._usual_share, found.inliers / len(layer))
-        return float(np.hypot(*(found.pose - registration.pose)[:2])) > MIN_JUMP_M
+        return _is_jump(found.pose, registration.pose)
 
     def _track_noise(self, scale: float) -> None:
         """Learn the range noise from the residuals: fast at first, then slowly."""
@@ -269,12 +318,16 @@ class Odometry:
         planar: kalman.Planar,
         vertical: kalman.Vertical,
         registration: Registration | None,
+        judgement: Judgement | None,
         z_shift: float,
         z_sigma: float,
     ) -> tuple[kalman.Planar, kalman.Vertical]:
         """While nothing moves, the pose is the origin by definition; once it moves, the filter is let go."""
-        if registration is None:
+        if registration is None or judgement is None:
             return planar, vertical
+        if judgement.weak_ratio < weak.SURE_OF_STANDING_RATIO and not self._standstill.is_on_ground:
+            self._standstill.is_standing, self._is_released = False, True
+            return weak.in_flight(planar, judgement.weak_axis), kalman.let_go_vertical(vertical, z_shift)
         noise = np.diag(np.linalg.inv(registration.information + np.diag([10.0, 10.0, 100.0])))
         shift = np.append(registration.pose, z_shift)
         if self._standstill.on_scan(history, shift, np.sqrt(np.append(noise, z_sigma**2))):
@@ -303,9 +356,11 @@ class Odometry:
         z_m = float(vertical.x[0])
         step_m = KEYFRAME_HEIGHT_M if z_m > LOW_M else KEYFRAME_HEIGHT_LOW_M
         climbed = abs(z_m - self._keyframe_z_m) > step_m
-        is_keyframe = accepted and (due or climbed)
+        is_keyframe = accepted and not self._is_lost and (due or climbed)
         planar_map = registration.map_variance + self._base_variance if accepted else old.map_variance[:3]
         quality = max(1, min(100, round(100 * registration.matched_ratio))) if accepted else old.quality
+        if judgement.is_degenerate:
+            quality = weak.quality_at(weak.sigma_along(planar, judgement.weak_axis), quality)
         if self._rejected_in_row >= FAILED_AFTER:
             quality = -1
         return Snapshot(
@@ -339,3 +394,7 @@ class Odometry:
             distance = np.hypot(waiting.ground[:, 0], waiting.ground[:, 1])
             self.height.ground.insert(ground, distance, float(waiting.variance[3]))
         self._keyframe_t_ns, self._keyframe_z_m = t_ns, z_m
+
+
+def _is_jump(pose: Array, before: Array) -> bool:
+    return float(np.hypot(*(pose[:2] - before[:2]))) > MIN_JUMP_M

@@ -13,6 +13,7 @@ RECENT = 5  # scans over which a shift is averaged
 MAX_RATE_RADPS = 0.2
 MAX_TILT_CHANGE_RAD = 0.06
 MAX_RANGEFINDER_CHANGE_M = 0.08
+ON_GROUND_M = 0.5  # a rangefinder that reads less than this, and always the same, stands on its legs
 SHIFT_SIGMAS = 4.0
 MIN_SHIFT = np.array([0.03, 0.03, 0.012, 0.04])  # x, y, yaw, z below which nothing is called a move
 
@@ -33,6 +34,12 @@ class Standstill:
     def rangefinder_m(self) -> float | None:
         """Median reading while standing."""
         return float(np.median(self._rangefinder)) if self._rangefinder else None
+
+    @property
+    def is_on_ground(self) -> bool:
+        """By rangefinder alone: what stands where walls cannot tell of motion."""
+        rest = self.rangefinder_m
+        return self.is_standing and rest is not None and rest < ON_GROUND_M
 
     def on_rangefinder(self, distance_m: float) -> None:
         if not self.is_standing:
