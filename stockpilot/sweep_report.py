@@ -67,8 +67,15 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
         "flights": len(reports),
         "completed": sum(report["state"] == "completed" for report in reports),
         "collisions": sum(bool(report["collision"]) for report in reports),
+        "lap_closed": sum(bool(report.get("lap_closed")) for report in reports),
+        "min_clearance_m_min": _min(_numbers(reports, "min_clearance_m")),
+        "wall_distance_rms_m_max": _max(_numbers(reports, "wall_distance_rms_m")),
+        "landed_from_start_m_max": _max(_numbers(reports, "landed_from_start_m")),
+        "odometry_max_gap_s_max": _max(_numbers(reports, "odometry_max_gap_s")),
         "e_p_m_median": _median(e_p),
         "e_p_m_max": _max(e_p),
+        "e_p_xy_m_median": _median(_numbers(reports, "e_p_xy_m")),
+        "e_yaw_deg_max": _max(_numbers(reports, "e_yaw_deg")),
         "cramer_rao_bound_m_median": _median(_numbers(reports, "cramer_rao_bound_m")),
         "abs_e_v_percent_median": _median(e_v),
         "abs_e_v_percent_max": _max(e_v),
@@ -173,6 +180,10 @@ def _numbers(rows: Sequence[dict[str, Any]], key: str, *, keep: bool = False) ->
 
 def _median(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
     return float(np.median(values)) if len(values) else None
+
+
+def _min(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+    return float(np.min(values)) if len(values) else None
 
 
 def _max(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
