@@ -58,6 +58,7 @@ format: setup
 
 lock:
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --all-extras --no-emit-index-url --no-header -o requirements.lock pyproject.toml
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --extra build -c requirements.lock --no-emit-index-url --no-header -o requirements-flight.lock pyproject.toml
 
 bench: setup
 	$(BIN)/python -m benchmarks.registration

@@ -20,16 +20,15 @@ from companion.errors import FileFormatError
 from companion.flight import Flight
 from companion.mapping.export import save_point_map
 from companion.mavlink.keys import open_signer
-from companion.messages import Event, Severity, VolumeReport
+from companion.messages import Event, PointMap, Severity, VolumeReport
 from companion.recording.log import Recorder
 from companion.recording.manifest import write_manifest
 from companion.telemetry.mqtt import Telemetry
 from companion.topics import EVENT, Topic
 from companion.warm_up import warm_up
-from stockpilot.leave import write_trajectory
+from stockpilot.files import volume_keys, write_json, write_trajectory
 from stockpilot.mission import Mission, load_mission
 from stockpilot.recorded import listen, open_recorder
-from stockpilot.results import write_json
 from stockpilot.telemetry import DELIVERY_S, mqtt_task, mqtt_telemetry
 
 HOUSEKEEPING_PERIOD_S = 1.0
@@ -41,7 +40,7 @@ def fly_command(
     record: bool, as_json: bool,
 ) -> int:  # fmt: skip
     """Exit code: 0 completed, 1 not."""
-    mission = load_mission(path, settings)
+    mission = load_mission(path, settings, with_world=False)
     metadata = _read_metadata(lidar_metadata)
     folder = out or Path("runs") / f"{mission.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -113,22 +112,6 @@ def flight_report(mission: Mission, flight: Flight, app: App, wall_time_s: float
     }  # fmt: skip
 
 
-def volume_keys(volume: VolumeReport | None) -> dict[str, Any]:
-    """The report's keys that speak of the volume; None where nothing was mapped."""
-    return {
-        "volume_m3": volume.volume_m3 if volume else None,
-        "volume_interval_m3": list(volume.interval_m3) if volume else None,
-        "volume_interval_level": volume.interval_level if volume else None,
-        "seen_ratio": volume.seen_ratio if volume else None,
-        "interpolated_ratio": volume.interpolated_ratio if volume else None,
-        "unseen_ratio": volume.unseen_ratio if volume else None,
-        "floor_area_m2": volume.floor_area_m2 if volume else None,
-        "pile_area_m2": volume.pile_area_m2 if volume else None,
-        "error_budget_m3": dict(volume.error_budget_m3) if volume else {},
-        "warnings": list(volume.warnings) if volume else ["nothing was mapped"],
-    }
-
-
 def _outcome(flight: Flight) -> dict[str, str]:
     navigation = flight.navigation
     if navigation is None:
@@ -147,30 +130,41 @@ async def _deliver(cfg: TelemetryConfig, spool: Path, report: dict[str, Any]) ->
 
 
 def _write(folder: Path, flight: Flight, report: dict[str, Any], volume: VolumeReport | None) -> None:
-    from stockpilot.pictures import draw_map, draw_surface, draw_trajectory
     from stockpilot.report import write_report_page
 
     point_map = flight.mapper.point_map()
     save_point_map(point_map, folder / "map.ply")
     save_point_map(point_map, folder / "map.laz")
     write_trajectory(folder / "trajectory.tum", flight.keyframes)
-    pictures: dict[str, Path] = {}
-    if len(point_map.points_map):
-        path = np.array([e.position_map_m for e in flight.keyframes], dtype=np.float64).reshape(-1, 3)
-        walls = [volume.footprint_m] if volume is not None and len(volume.footprint_m) else []
-        pictures["trajectory"] = draw_trajectory(
+    pictures = _draw(folder, flight, point_map, volume, report["mission"]) if len(point_map.points_map) else {}
+    write_report_page(folder / "report.html", report, pictures)
+    write_json(folder / "report.json", report)
+    write_manifest(folder)
+
+
+def _draw(
+    folder: Path, flight: Flight, point_map: PointMap, volume: VolumeReport | None, title: str
+) -> dict[str, Path]:
+    """Pictures, where matplotlib is: it comes with the extra `sim` and need not be on a vehicle."""
+    try:
+        from stockpilot.pictures import draw_map, draw_surface, draw_trajectory
+    except ImportError:
+        return {}
+    path = np.array([e.position_map_m for e in flight.keyframes], dtype=np.float64).reshape(-1, 3)
+    walls = [volume.footprint_m] if volume is not None and len(volume.footprint_m) else []
+    pictures = {
+        "trajectory": draw_trajectory(
             folder / "trajectory.png",
             outlines=walls,
             truth_world_m=None,
             estimated_world_m=path[:, :2],
-            title=report["mission"],
-        )
-        pictures["map"] = draw_map(folder / "map.png", point_map)
-        if volume is not None:
-            pictures["surface"] = draw_surface(folder / "surface.png", volume)
-    write_report_page(folder / "report.html", report, pictures)
-    write_json(folder / "report.json", report)
-    write_manifest(folder)
+            title=title,
+        ),
+        "map": draw_map(folder / "map.png", point_map),
+    }
+    if volume is not None:
+        pictures["surface"] = draw_surface(folder / "surface.png", volume)
+    return pictures
 
 
 def _read_metadata(path: Path | None) -> str | None:

@@ -8,12 +8,11 @@ import numpy as np
 import yaml
 
 from companion.mapping.export import save_point_map
-from companion.messages import Array, OdometryEstimate
+from companion.messages import Array
 from companion.recording.manifest import write_manifest
-from companion.recording.tum import tum_line
+from stockpilot.files import write_json, write_trajectory
 from stockpilot.pictures import draw_map, draw_surface, draw_trajectory
 from stockpilot.report import write_report_page
-from stockpilot.results import write_json
 from stockpilot.run import Flown
 
 
@@ -43,11 +42,6 @@ def write_results(folder: Path, flown: Flown) -> None:
     write_report_page(folder / "report.html", scored.report, pictures)
     write_json(folder / "report.json", scored.report)
     write_manifest(folder)
-
-
-def write_trajectory(path: Path, estimates: list[OdometryEstimate]) -> None:
-    """TUM lines of full precision: t x y z qx qy qz qw."""
-    path.write_text("".join(tum_line(estimate) for estimate in estimates), encoding="utf-8")
 
 
 def _paper_world(flown: Flown) -> Array:

@@ -7,14 +7,16 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from companion.config import CompanionConfig, LidarConfig
 from companion.errors import ConfigError
-from simbridge.config import LidarSimConfig, SimConfig
+
+if TYPE_CHECKING:  # the emulated side is an extra: on a vehicle it need not be there
+    from simbridge.config import SimConfig
 
 LABELS = ("name", "description")
 SIM_SECTIONS = ("seed", "world", "vehicle", "autopilot", "faults")
@@ -51,10 +53,13 @@ class Mission:
         return {**out, "lidar": lidar, **flies}
 
 
-def load_mission(path: Path | str, settings: Sequence[str] = (), *, seed: int | None = None) -> Mission:
+def load_mission(
+    path: Path | str, settings: Sequence[str] = (), *, seed: int | None = None, with_world: bool = True
+) -> Mission:
     """Read, set, and check a mission file.
 
     Args:
+        with_world: read the sections of the emulated side too; a vehicle has no use for them, and not the code.
         settings: "key=value" with dotted keys, as given by --set; values are YAML.
     Raises: ConfigError: every fault found, one a line: file and line, key, value, what is allowed.
     """
@@ -64,11 +69,16 @@ def load_mission(path: Path | str, settings: Sequence[str] = (), *, seed: int | 
         _apply_setting(raw, setting)
     if seed is not None:
         raw["seed"] = seed
-    return build_mission(raw, source=str(path), lines=lines, name=path.stem)
+    return build_mission(raw, source=str(path), lines=lines, name=path.stem, with_world=with_world)
 
 
 def build_mission(
-    raw: dict[str, Any], *, source: str, lines: Mapping[Location, int] | None = None, name: str = "mission"
+    raw: dict[str, Any],
+    *,
+    source: str,
+    lines: Mapping[Location, int] | None = None,
+    name: str = "mission",
+    with_world: bool = True,
 ) -> Mission:
     """A mission from its parsed sections. Raises: ConfigError."""
     problems: list[str] = []
@@ -80,34 +90,46 @@ def build_mission(
     if not isinstance(lidar, dict):
         problems.append(teller.say(("lidar",), lidar, "must be a section of keys and values"))
         lidar = {}
-    lidar_keys = {*LidarConfig.model_fields, *LidarSimConfig.model_fields}
-    problems += [teller.unknown(("lidar", k), v, sorted(lidar_keys)) for k, v in lidar.items() if k not in lidar_keys]
-
     flies = {k: raw[k] for k in COMPANION_SECTIONS if raw.get(k) is not None}
     flies["lidar"] = {k: v for k, v in lidar.items() if k in LidarConfig.model_fields}
     companion = _validate(CompanionConfig, flies, raw, teller, problems)
     if companion is not None:
         problems += _companion_checks(companion, teller)
-    sim: SimConfig | None = None
-    if any(": lidar" in problem for problem in problems):
-        pass  # the emulated side would only say the same again
-    elif raw.get("world") is not None:
-        emulated = {k: raw[k] for k in SIM_SECTIONS if raw.get(k) is not None}
-        shared = companion.lidar.model_dump() if companion is not None else {}
-        emulated["lidar"] = {
-            k: v for k, v in {**shared, **lidar}.items() if k in LidarSimConfig.model_fields
-        }  # the same sensor on both sides, defaults included
-        sim = _validate(SimConfig, emulated, raw, teller, problems)
-    elif any(raw.get(k) is not None for k in ("vehicle", "faults")):
-        problems.append(teller.say(("world",), None, "is missing: a vehicle or faults to emulate need a world"))
-    if companion is not None and sim is not None and not problems:
-        problems += _world_checks(companion, sim, teller)
+    sim = _emulated_side(raw, lidar, companion, teller, problems) if with_world else None
     if problems or companion is None:
         raise ConfigError("\n".join(dict.fromkeys(problems)))
     return Mission(
         name=str(raw.get("name") or name), description=str(raw.get("description") or ""), path=source,
         companion=companion, sim=sim,
     )  # fmt: skip
+
+
+def _emulated_side(
+    raw: dict[str, Any],
+    lidar: dict[str, Any],
+    companion: CompanionConfig | None,
+    teller: _Teller,
+    problems: list[str],
+) -> SimConfig | None:
+    """The sections of simbridge, checked also against those that fly; None where the mission has no world."""
+    from simbridge.config import LidarSimConfig, SimConfig
+
+    keys = {*LidarConfig.model_fields, *LidarSimConfig.model_fields}
+    problems += [teller.unknown(("lidar", k), v, sorted(keys)) for k, v in lidar.items() if k not in keys]
+    if raw.get("world") is None:
+        if any(raw.get(k) is not None for k in ("vehicle", "faults")):
+            problems.append(teller.say(("world",), None, "is missing: a vehicle or faults to emulate need a world"))
+        return None
+    if any(": lidar" in problem for problem in problems):
+        return None  # the emulated side would only say the same again
+    emulated = {k: raw[k] for k in SIM_SECTIONS if raw.get(k) is not None}
+    shared = companion.lidar.model_dump() if companion is not None else {}
+    # the same sensor on both sides, defaults included
+    emulated["lidar"] = {k: v for k, v in {**shared, **lidar}.items() if k in LidarSimConfig.model_fields}
+    sim = _validate(SimConfig, emulated, raw, teller, problems)
+    if companion is not None and sim is not None and not problems:
+        problems += _world_checks(companion, sim, teller)
+    return sim
 
 
 def _companion_checks(companion: CompanionConfig, teller: _Teller) -> Iterator[str]:

@@ -6,7 +6,7 @@ import subprocess
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import yaml
 
@@ -14,8 +14,10 @@ from companion.flight import Flight
 from companion.messages import LevelledScan
 from companion.recording.log import Recorder
 from companion.topics import Topic
-from stockpilot.lockstep import Lockstep
 from stockpilot.mission import Mission
+
+if TYPE_CHECKING:  # needs the emulated side
+    from stockpilot.lockstep import Lockstep
 
 GIB = 1 << 30
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import resource
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +17,7 @@ from companion.odometry.paper import PaperPipeline
 from companion.volume import estimate_volume
 from companion.volume.paper import paper_volume
 from simbridge.world import World
+from stockpilot.files import volume_keys
 from stockpilot.lockstep import Outcome
 from stockpilot.mission import Mission
 from stockpilot.score import MapPin, PoseScore, cramer_rao_bound_m, pin_map, score_poses, wall_distance_rms_m
@@ -79,16 +77,7 @@ def score_flight(
             outcome.truth, world.wall_outlines(), mission.companion.navigator.wall_distance_m
         ),
         "landed_from_start_m": _landed_from_start(outcome),
-        "volume_m3": volume.volume_m3 if volume else None,
-        "volume_interval_m3": list(volume.interval_m3) if volume else None,
-        "volume_interval_level": volume.interval_level if volume else None,
-        "seen_ratio": volume.seen_ratio if volume else None,
-        "interpolated_ratio": volume.interpolated_ratio if volume else None,
-        "unseen_ratio": volume.unseen_ratio if volume else None,
-        "floor_area_m2": volume.floor_area_m2 if volume else None,
-        "pile_area_m2": volume.pile_area_m2 if volume else None,
-        "error_budget_m3": dict(volume.error_budget_m3) if volume else {},
-        "warnings": list(volume.warnings) if volume else ["nothing was mapped"],
+        **volume_keys(volume),
         "odometry_max_gap_s": outcome.odometry_max_gap_s,
         "truth_volume_m3": truth_volume,
         "e_v_percent": _error_percent(volume.volume_m3 if volume else None, truth_volume),
@@ -186,26 +175,3 @@ def _error_percent(volume_m3: float | None, truth_m3: float) -> float | None:
     if volume_m3 is None or truth_m3 <= 0 or not math.isfinite(volume_m3):
         return None
     return 100.0 * (volume_m3 - truth_m3) / truth_m3
-
-
-def write_json(path: Path, data: dict[str, Any]) -> None:
-    """Written whole or not at all; numbers that are not numbers become null."""
-    temporary = path.with_name(path.name + ".part")
-    with temporary.open("w", encoding="utf-8") as file:
-        json.dump(_finite(data), file, indent=2, allow_nan=False)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    return value

@@ -21,8 +21,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from companion.config import Section
 from companion.errors import ConfigError
+from stockpilot.files import write_json
 from stockpilot.mission import load_mission
-from stockpilot.results import write_json
 
 
 class SweepFile(Section):

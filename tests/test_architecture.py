@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -51,4 +53,22 @@ def test_dataflow_table_is_generated_from_the_topics() -> None:
 
 
 def test_no_committed_lock_names_a_download_address() -> None:
-    assert "://" not in (ROOT / "requirements.lock").read_text(encoding="utf-8")
+    for lock in ("requirements.lock", "requirements-flight.lock"):
+        assert "://" not in (ROOT / lock).read_text(encoding="utf-8")
+
+
+def test_what_flies_needs_nothing_of_the_emulated_side() -> None:
+    """On a vehicle the extra `sim` need not be installed: `stockpilot fly` must load and read a mission without it."""
+    program = (
+        "import sys\n"
+        "class Absent:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] in ('simbridge', 'mujoco', 'shapely', 'trimesh', 'matplotlib', 'dask', 'pandas'):\n"
+        "            raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
+        "import stockpilot.fly, stockpilot.report\n"
+        "from stockpilot.mission import load_mission\n"
+        "assert load_mission('missions/cement_store.yaml', with_world=False).sim is None\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
