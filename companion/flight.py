@@ -150,6 +150,7 @@ class Flight:
         """Take a registered scan in. True if it belongs in the map: then `mapper.add` it, where it holds up nothing."""
         self.record("accept", t_ns, b"", None)
         self.scans += 1
+        self.odometry.publish()
         if result is None:
             return False
         estimate = result.estimate

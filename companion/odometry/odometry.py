@@ -46,6 +46,7 @@ MAX_PENDING = 100  # scans kept until the next keyframe
 STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
+MIN_VALID_COLUMNS_FIRST_RATIO = 0.75  # the first scan makes the map: one that was joined in mid-turn would ruin it
 SUDDEN_LOSS = 0.15  # share of the layer's points that lose their wall at once
 MIN_JUMP_M = 0.2
 
@@ -88,6 +89,7 @@ class Odometry:
         self._attitude = AttitudeBuffer()
         self._rangefinder: list[RangefinderSample] = []
         self._snapshot: Snapshot | None = None
+        self._published: Snapshot | None = None
         self.walls = WallMap()
         self.height = HeightTracker(cfg.lidar.mount_position_m[2])
         self._standstill = Standstill()
@@ -117,7 +119,7 @@ class Odometry:
 
     def predict(self, t_ns: int) -> OdometryEstimate | None:
         """The estimate at t_ns (not before the newest scan), or None before the first scan. Cheap; any thread."""
-        snapshot, history = self._snapshot, self._attitude.history
+        snapshot, history = self._published, self._attitude.history
         if snapshot is None or history is None:
             return None
         return estimate_at(snapshot, history, max(t_ns, snapshot.t_scan_ns), is_scan=False)
@@ -129,8 +131,15 @@ class Odometry:
         return partial(self._process, scan, self._attitude.history, samples)
 
     def on_scan(self, scan: LidarScan) -> ScanResult | None:
-        """Both at once. None when the scan cannot be used at all (counted in `dropped`)."""
-        return self.begin(scan)()
+        """All at once. None when the scan cannot be used at all (counted in `dropped`)."""
+        result = self.begin(scan)()
+        self.publish()
+        return result
+
+    def publish(self) -> None:
+        """From now on `predict` starts from the scan last processed: called where its result is taken in, so that the
+        moment does not depend on when a thread was done, and replay repeats it."""
+        self._published = self._snapshot
 
     def _process(
         self, scan: LidarScan, history: AttitudeHistory | None, samples: list[RangefinderSample]
@@ -192,7 +201,9 @@ class Odometry:
             reason = "no attitude"
         elif self._snapshot is not None and scan.t_ns <= self._snapshot.t_scan_ns:
             reason = "repeated"
-        elif float(np.mean(scan.column_valid)) < MIN_VALID_COLUMNS_RATIO:
+        elif float(np.mean(scan.column_valid)) < (
+            MIN_VALID_COLUMNS_FIRST_RATIO if self._snapshot is None else MIN_VALID_COLUMNS_RATIO
+        ):
             reason = "too few columns"
         if reason:
             self.dropped[reason] += 1
