@@ -46,6 +46,7 @@ MAX_PENDING = 100  # scans kept until the next keyframe
 STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
+WAIT_FOR_FIRST_SCANS = 5
 MIN_VALID_COLUMNS_FIRST_RATIO = 0.75  # the first scan makes the map: one that was joined in mid-turn would ruin it
 SUDDEN_LOSS = 0.15  # share of the layer's points that lose their wall at once
 MIN_JUMP_M = 0.2
@@ -201,13 +202,16 @@ class Odometry:
             reason = "no attitude"
         elif self._snapshot is not None and scan.t_ns <= self._snapshot.t_scan_ns:
             reason = "repeated"
-        elif float(np.mean(scan.column_valid)) < (
-            MIN_VALID_COLUMNS_FIRST_RATIO if self._snapshot is None else MIN_VALID_COLUMNS_RATIO
-        ):
+        elif float(np.mean(scan.column_valid)) < self._least_valid_ratio():
             reason = "too few columns"
         if reason:
             self.dropped[reason] += 1
         return bool(reason)
+
+    def _least_valid_ratio(self) -> float:
+        """The first scan is waited for: a fuller one comes at the next turn, unless packets are lost all the time."""
+        is_waiting = self._snapshot is None and self.dropped["too few columns"] < WAIT_FOR_FIRST_SCANS
+        return MIN_VALID_COLUMNS_FIRST_RATIO if is_waiting else MIN_VALID_COLUMNS_RATIO
 
     def _first(self, scan: LidarScan, planar: kalman.Planar, vertical: kalman.Vertical) -> Snapshot:
         return Snapshot(
