@@ -149,6 +149,8 @@ class SensorFaults:
 
     def lidar_bias_m(self, t_ns: int) -> float:
         """What a wrong LiDAR adds to its ranges: it measures so, its packets are sound."""
+        if not self._lidar:
+            return 0.0
         return sum(
             c.cfg.wrong_by
             for c in self._lidar

@@ -83,35 +83,47 @@ def _inertial(q0: Array, q1: Array, v0: Array, v1: Array, step_s: float, gravity
 
 def _aim(
     directions: Array,
+    first: int,
+    count: int,
     t_first_s: float,
     period_s: float,
-    quat: Array,
-    rate: Array,
-    velocity: Array,
+    before: Array,
+    pose: Array,
+    motion: Array,
     lever: Array,
     rays: Array,
     shifts: Array,
+    origin: Array,
 ) -> None:
     """World directions of some columns, each at its own time, and how far its origin is from the common one.
 
-    directions: (columns, rows, 3) in body. t_first_s: of the first column, from the common pose. rate: body. velocity: world.
-    lever: the beams' origin in body. rays: (columns * rows * 3,). shifts: (columns, 3).
+    directions: (columns, rows, 3) in body, those from `first` on are cast. t_first_s: of the first column, from the
+    middle of the step. before, pose: (7,) position and quaternion at both ends of the step, motion: (6,) at its end,
+    velocity in `world`, turn rate in body. lever: the beams' origin in body. rays: (columns * rows * 3,).
+    shifts: (columns, 3). origin: (3,) of the beams in the middle of the step.
     """
+    quat = np.empty(4)
+    for k in range(4):  # neighbours in time: never near opposite signs
+        quat[k] = before[3 + k] + pose[3 + k]
+    quat /= math.sqrt(quat[0] ** 2 + quat[1] ** 2 + quat[2] ** 2 + quat[3] ** 2)
     r = np.empty((3, 3))
     rotation(quat, r)
-    lx = rate[1] * lever[2] - rate[2] * lever[1]
-    ly = rate[2] * lever[0] - rate[0] * lever[2]
-    lz = rate[0] * lever[1] - rate[1] * lever[0]
+    rx, ry, rz = motion[3], motion[4], motion[5]
+    lx = ry * lever[2] - rz * lever[1]
+    ly = rz * lever[0] - rx * lever[2]
+    lz = rx * lever[1] - ry * lever[0]
+    for k in range(3):
+        origin[k] = 0.5 * (before[k] + pose[k]) + r[k, 0] * lever[0] + r[k, 1] * lever[1] + r[k, 2] * lever[2]
     n = 0
-    for c in range(directions.shape[0]):
+    for c in range(count):
         t = t_first_s + c * period_s
         for k in range(3):
-            shifts[c, k] = t * (velocity[k] + r[k, 0] * lx + r[k, 1] * ly + r[k, 2] * lz)
+            shifts[c, k] = t * (motion[k] + r[k, 0] * lx + r[k, 1] * ly + r[k, 2] * lz)
         for i in range(directions.shape[1]):
-            x, y, z = directions[c, i, 0], directions[c, i, 1], directions[c, i, 2]
-            bx = x + t * (rate[1] * z - rate[2] * y)
-            by = y + t * (rate[2] * x - rate[0] * z)
-            bz = z + t * (rate[0] * y - rate[1] * x)
+            x, y, z = directions[first + c, i, 0], directions[first + c, i, 1], directions[first + c, i, 2]
+            bx = x + t * (ry * z - rz * y)
+            by = y + t * (rz * x - rx * z)
+            bz = z + t * (rx * y - ry * x)
             scale = 1.0 / math.sqrt(bx * bx + by * by + bz * bz)
             for k in range(3):
                 rays[n] = scale * (r[k, 0] * bx + r[k, 1] * by + r[k, 2] * bz)
@@ -123,6 +135,8 @@ def _returns(
     normals: Array,
     rays: Array,
     shifts: Array,
+    offset: int,
+    count: int,
     noise: Array,
     chance: Array,
     params: Array,
@@ -131,21 +145,27 @@ def _returns(
     range_mm: NDArray[np.uint32],
     signal: NDArray[np.uint16],
 ) -> None:
-    """What the sensor makes of the rays of some columns: writes into range_mm, signal (rows, packet columns).
+    """What the sensor makes of the rays of some columns: writes into range_mm, signal (packets, 16, rows) of a turn.
 
-    distance: from the common origin, negative where nothing was hit. noise: (columns, rows) standard normal.
-    chance: (columns, rows, 3) uniform, for dust, its place, and loss. params: see `lidar.py`.
+    Of the rays (distance, normals, rays, shifts: columns one after the other) those of `count` columns from `offset` on;
+    they are the columns from `first` on of the turn. distance: from the common origin, negative where nothing was hit.
+    noise: (columns, rows) standard normal. chance: (columns, rows, 3) uniform, for dust, its place, and loss. Both are a
+    whole turn's. params: see `lidar.py`.
     """
     sigma, low, high = params[0], params[1], params[2]
     grazing_cos, dropout, dust_per_m, lost, bias = params[3], params[4], params[5], params[6], params[7]
     rows = row_index.shape[0]
-    for c in range(shifts.shape[0]):
+    width = range_mm.shape[1]
+    for c in range(count):
+        at = offset + c
+        column = first + c
+        packet, into = column // width, column % width
         for i in range(rows):
-            n = c * rows + i
+            n = at * rows + i
             m = 3 * n
             row = row_index[i]
-            range_mm[row, first + c] = 0
-            signal[row, first + c] = 0
+            range_mm[packet, into, row] = 0
+            signal[packet, into, row] = 0
             r = distance[n]
             if r < 0.0:
                 continue
@@ -153,7 +173,7 @@ def _returns(
             cosine = abs(facing)
             if cosine > 0.02:  # seen from its own origin: exact for a plane
                 r -= (
-                    shifts[c, 0] * normals[m] + shifts[c, 1] * normals[m + 1] + shifts[c, 2] * normals[m + 2]
+                    shifts[at, 0] * normals[m] + shifts[at, 1] * normals[m + 1] + shifts[at, 2] * normals[m + 2]
                 ) / facing
             strength = 4000.0 * cosine
             loss = dropout
@@ -162,18 +182,18 @@ def _returns(
             if dust_per_m > 0.0:
                 clear = math.exp(-dust_per_m * r)
                 strength *= clear * clear
-                if chance[c, i, 0] > clear:  # caught on the way: at a place as Beer and Lambert have it
-                    if (chance[c, i, 0] - clear) / (1.0 - clear) < lost:
+                if chance[column, i, 0] > clear:  # caught on the way: at a place as Beer and Lambert have it
+                    if (chance[column, i, 0] - clear) / (1.0 - clear) < lost:
                         continue
-                    r = -math.log(1.0 - chance[c, i, 1] * (1.0 - clear)) / dust_per_m
+                    r = -math.log(1.0 - chance[column, i, 1] * (1.0 - clear)) / dust_per_m
                     strength = 200.0
-            if chance[c, i, 2] < loss:
+            if chance[column, i, 2] < loss:
                 continue
-            r += sigma * noise[c, i] + bias
+            r += sigma * noise[column, i] + bias
             if r < low or r > high:
                 continue
-            range_mm[row, first + c] = np.uint32(r * 1000.0 + 0.5)
-            signal[row, first + c] = np.uint16(min(strength / max(0.04 * r * r, 0.25), 65535.0))
+            range_mm[packet, into, row] = np.uint32(r * 1000.0 + 0.5)
+            signal[packet, into, row] = np.uint16(min(strength / max(0.04 * r * r, 0.25), 65535.0))
 
 
 def _triangle(z: Array, x0: float, y0: float, cell_m: float, x: float, y: float) -> tuple[float, float, float]:
@@ -220,10 +240,11 @@ def warm_up() -> None:
     q, v, z3 = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(3)
     rotors(np.zeros(4), np.zeros(4), np.zeros((4, 3)), q, v, z3, np.zeros(4), np.zeros(6))
     inertial(q, q, v, v, 0.004, 9.81, np.zeros(6))
-    aim(np.ones((1, 1, 3)), 0.0, 0.0, q, z3, z3, z3, np.zeros(3), np.zeros((1, 3)))
+    aim(np.ones((1, 1, 3)), 0, 1, 0.0, 0.0, np.ones(7), np.ones(7), v, z3, np.zeros(3), np.zeros((1, 3)), np.zeros(3))
     triangle(np.zeros((2, 2)), 0.0, 0.0, 1.0, 0.0, 0.0)
     nearest_obstacle(np.zeros((1, 9)), 0.0, 0.0, 0.0)
+    image = np.zeros((2, 16, 2), dtype=[("range", "<u4"), ("signal", "<u2")])  # strided, as in a packet
     returns(
-        np.ones(1), np.ones(3), np.ones(3), np.zeros((1, 3)), np.zeros((1, 1)), np.zeros((1, 1, 3)), np.zeros(8),
-        np.zeros(1, dtype=np.int64), 0, np.zeros((16, 2), dtype=np.uint32)[:, :1].T, np.zeros((16, 2), dtype=np.uint16)[:, :1].T,
+        np.ones(1), np.ones(3), np.ones(3), np.zeros((1, 3)), 0, 1, np.zeros((1, 1)), np.zeros((1, 1, 3)), np.zeros(8),
+        np.zeros(1, dtype=np.int64), 0, image["range"], image["signal"],
     )  # fmt: skip

@@ -35,6 +35,7 @@ class Lidar:
         self._model, self._data, self._body_id = model, data, body_id
         self._columns, self._per_s = cfg.columns, cfg.columns * cfg.rate_hz
         self._began_ns, self._clock_offset_ns = began_ns, round(cfg.clock_offset_s * NS)
+        self._turn_ns = NS // cfg.rate_hz
         self.metadata_json: str = sensor_info(cfg).to_json_string()
         self._writer = PacketWriter(cfg)
         self._rows = np.array([row for row in range(cfg.rows) if row not in cfg.rows_off], dtype=np.int64)
@@ -46,12 +47,13 @@ class Lidar:
         self._noise = np.zeros((cfg.columns, len(self._rows)))
         self._chance = np.zeros((cfg.columns, len(self._rows), 3))
         self._params = _parameters(cfg)
+        packets = cfg.columns // COLUMNS_PER_PACKET
+        self._stamps = self._t_ns(np.arange(cfg.columns)).reshape(packets, COLUMNS_PER_PACKET) + self._clock_offset_ns
         most = self._per_s * step_ns // NS + 2  # columns of the longest step
-        self._shifts = np.zeros((most, 3))
+        self._shifts, self._origin = np.zeros((most, 3)), np.zeros(3)
         self._rays, self._normals = np.zeros(3 * most * len(self._rows)), np.zeros(3 * most * len(self._rows))
         self._distance = np.zeros(most * len(self._rows))
         self._geom = np.zeros(most * len(self._rows), dtype=np.int32)
-        self._within = np.arange(COLUMNS_PER_PACKET)
         self._next = 0  # column, counted from the first one
 
     @property
@@ -63,27 +65,24 @@ class Lidar:
     def range_bias_m(self, bias_m: float) -> None:
         self._params[BIAS] = bias_m
 
-    def cast(
-        self, t_pose_ns: int, t_end_ns: int, position: Array, quat: Array, velocity: Array, rate: Array
-    ) -> list[bytes]:
+    def cast(self, t_middle_ns: int, t_end_ns: int, before: Array, pose: Array, motion: Array) -> list[bytes]:
         """Measure the columns up to t_end and give the packets that are done.
 
-        position, quat (wxyz), velocity in `world`, rate in body (FLU): the motion at t_pose, near the columns' times.
+        before, pose: (7,) position and quaternion (wxyz) in `world` at the step's ends; t_middle is halfway. motion: (6,)
+        velocity in `world`, turn rate in body (FLU), at the end.
         """
         first, end = self._next, (t_end_ns - self._began_ns) * self._per_s // NS + 1
         if end <= first:
             return []
         self._next = end
-        self._shoot(first, end - first, t_pose_ns, position, quat, velocity, rate)
-        packets = []
+        self._shoot(first, end - first, t_middle_ns, before, pose, motion)
         column = first
         while column < end:
-            into = column % COLUMNS_PER_PACKET
-            count = min(end - column, COLUMNS_PER_PACKET - into)
-            self._receive(column, count, column - first, into)
+            into = column % self._columns
+            count = min(end - column, self._columns - into)
+            self._receive(into, count, column - first)
             column += count
-            if into + count == COLUMNS_PER_PACKET:
-                packets.append(self._pack(column - COLUMNS_PER_PACKET))
+        packets = [self._pack(n) for n in range(first // COLUMNS_PER_PACKET, end // COLUMNS_PER_PACKET)]
         if self._loss_ratio > 0.0:
             packets = [packet for packet in packets if self._loss_rng.random() >= self._loss_ratio]
         return packets
@@ -92,50 +91,33 @@ class Lidar:
         """Simulated time of a column."""
         return self._began_ns + column * NS // self._per_s
 
-    def _shoot(
-        self, first: int, count: int, t_pose_ns: int, position: Array, quat: Array, velocity: Array, rate: Array
-    ) -> None:
+    def _shoot(self, first: int, count: int, t_middle_ns: int, before: Array, pose: Array, motion: Array) -> None:
         """One mj_multiRay for the columns of a step, all from the pose's origin, each in its own direction."""
-        start = first % self._columns
-        t_first_s = (self._began_ns + first * NS // self._per_s - t_pose_ns) * 1e-9
+        t_first_s = (self._began_ns + first * NS // self._per_s - t_middle_ns) * 1e-9
         aim(
-            self._directions[start : start + count],
-            t_first_s,
-            1.0 / self._per_s,
-            quat,
-            rate,
-            velocity,
-            self._lever,
-            self._rays,
-            self._shifts,
-        )
-        origin = np.empty(3)
-        mujoco.mju_rotVecQuat(origin, self._lever, quat)
-        origin += position
+            self._directions, first % self._columns, count, t_first_s, 1.0 / self._per_s, before, pose, motion,
+            self._lever, self._rays, self._shifts, self._origin,
+        )  # fmt: skip
         n = count * len(self._rows)
         mujoco.mj_multiRay(
-            self._model, self._data, origin, self._rays[: 3 * n], RAY_GROUPS, 1, self._body_id,
+            self._model, self._data, self._origin, self._rays[: 3 * n], RAY_GROUPS, 1, self._body_id,
             self._geom[:n], self._distance[:n], self._normals[: 3 * n], n, CUTOFF_M,
         )  # fmt: skip
 
-    def _receive(self, column: int, count: int, offset: int, into: int) -> None:
-        """Noise and losses on `count` columns of this step's rays, into the packet that is being filled."""
-        start = column % self._columns
-        if start == 0:
+    def _receive(self, first: int, count: int, offset: int) -> None:
+        """Noise and losses on `count` columns of this step's rays, into the packets of the turn that is being filled."""
+        if first == 0:
             self._noise_rng.standard_normal(out=self._noise)
             self._chance_rng.random(out=self._chance)
-        a, b = offset * len(self._rows), (offset + count) * len(self._rows)
         returns(
-            self._distance[a:b], self._normals[3 * a : 3 * b], self._rays[3 * a : 3 * b],
-            self._shifts[offset : offset + count], self._noise[start : start + count],
-            self._chance[start : start + count], self._params, self._rows, into,
-            self._writer.range_mm, self._writer.signal,
+            self._distance, self._normals, self._rays, self._shifts, offset, count, self._noise, self._chance,
+            self._params, self._rows, first, self._writer.range_mm, self._writer.signal,
         )  # fmt: skip
 
-    def _pack(self, column: int) -> bytes:
-        t_ns = self._t_ns(column + self._within) + self._clock_offset_ns
-        turn, first = divmod(column, self._columns)
-        return self._writer.pack(turn, first, t_ns)
+    def _pack(self, number: int) -> bytes:
+        """The packet of this number, counted from the first turn's first."""
+        turn, packet = divmod(number, len(self._stamps))
+        return self._writer.pack(turn, packet, self._stamps[packet] + turn * self._turn_ns)
 
 
 def _parameters(cfg: LidarSimConfig) -> Array:

@@ -79,17 +79,19 @@ class Simulation:
         v = self._vehicle
         self._lidar = Lidar(self.world.model, v.data, v.body_id, cfg.lidar, cfg.seed, BOOT_NS, step_ns)
         self._faults = SensorFaults(cfg.faults, cfg.seed, BOOT_NS)
+        self._before = np.zeros(7)  # pose at the step's beginning
         self._packets: list[bytes] = []
         self._clearance_m, self._clearance_place = -math.inf, v.position.copy()  # where it was last computed
 
     def step(self) -> None:
         """4 ms: what the sensors measured goes to the flight controller, its motor commands move the vehicle."""
         vehicle = self._vehicle
-        position, quat, velocity = vehicle.position.copy(), vehicle.q_world_body_wxyz.copy(), vehicle.motion[:3].copy()
+        self._before[:] = vehicle.pose
+        falling_mps = -float(vehicle.motion[2])
         for _ in range(self._commands):
             self._command()
-        self._turn_lidar(position, quat)
-        self._watch(velocity)
+        self._turn_lidar()
+        self._watch(falling_mps)
 
     def _command(self) -> None:
         t_ns, vehicle, faults = self.t_ns, self._vehicle, self._faults
@@ -132,19 +134,15 @@ class Simulation:
         v = self._vehicle
         return float(mujoco.mj_ray(self.world.model, v.data, v.position, down, RAY_GROUPS, 1, v.body_id, None, None))
 
-    def _turn_lidar(self, position_before: Array, quat_before: Array) -> None:
+    def _turn_lidar(self) -> None:
         """Columns of the step just flown, from the pose in its middle."""
-        v = self._vehicle
-        middle = 0.5 * (position_before + v.position)
-        quat = quat_before + v.q_world_body_wxyz  # neighbours in time: never near opposite signs
-        quat /= math.sqrt(float(quat @ quat))
-        t_ns = self.t_ns
+        t_ns, vehicle = self.t_ns, self._vehicle
         self._lidar.range_bias_m = self._faults.lidar_bias_m(t_ns)
-        packets = self._lidar.cast(t_ns - self._step_ns // 2, t_ns, middle, quat, v.motion[:3], v.motion[3:])
+        packets = self._lidar.cast(t_ns - self._step_ns // 2, t_ns, self._before, vehicle.pose, vehicle.motion)
         self._packets += self._faults.lidar(packets, t_ns)
 
-    def _watch(self, velocity_before: Array) -> None:
-        """Lift-off, collision and clearance."""
+    def _watch(self, falling_mps: float) -> None:
+        """Lift-off, collision and clearance. falling_mps: before the step."""
         vehicle = self._vehicle
         if self._faults.liftoff_ns is None and float(vehicle.position[2]) > self._ground_z + LIFTOFF_M:
             self._faults.liftoff_ns = self.t_ns
@@ -154,7 +152,7 @@ class Simulation:
             return
         if vehicle.touches_store:
             self.collision = True
-        elif float(velocity_before[2]) < -HARD_LANDING_MPS or vehicle.up_cos < TOPPLED_COS:
+        elif falling_mps > HARD_LANDING_MPS or vehicle.up_cos < TOPPLED_COS:
             self.collision = True  # on the ground, but not as one lands
 
     def _note_clearance(self) -> None:

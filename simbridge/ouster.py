@@ -12,6 +12,7 @@ import math
 from typing import Any
 
 import numpy as np
+from fastcrc import crc64
 from numpy.typing import NDArray
 from ouster.sdk import core
 
@@ -24,6 +25,7 @@ SENSOR_ABOVE_BASE_M = 0.03618  # origin of the lidar frame above that of the sen
 SERIAL = 992100000000
 INIT_ID = 1
 ALBEDO = 40
+CRC_BYTES = 8  # CRC-64/XZ at a packet's end
 UDP_PORT_LIDAR = 7502  # Ouster's own
 
 
@@ -70,30 +72,29 @@ def directions_sensor(cfg: LidarSimConfig) -> Array:
 class PacketWriter:
     """Lidar packets of COLUMNS_PER_PACKET columns each, as they are measured.
 
-    Fill range_mm (rows, 16) uint32, below 2^19, and signal (rows, 16) uint16 and call `pack`. ouster-sdk packs whole
-    frames only, and slowly: this has it pack one packet, whose changing parts are then overwritten in place (a test
-    packs the same by the SDK).
+    Fill range_mm (packets of a turn, 16, rows) uint32, below 2^19, and signal (the same) uint16 and call `pack`.
+    ouster-sdk packs whole frames only, and slowly: this has it pack one packet, whose changing parts are then
+    overwritten in place (a test packs the same by the SDK).
     """
 
     def __init__(self, cfg: LidarSimConfig) -> None:
-        self._format = core.PacketFormat(sensor_info(cfg))
-        self._max_frame_id = int(self._format.max_frame_id)
-        self._bytes: NDArray[np.uint8] = _template(cfg, self._format)
-        packet = self._bytes.view(_packet_type(cfg.rows, self._format))  # (1,)
-        self._frame_id, self._crc = packet["frame_id"], packet["crc"]
-        column = packet["column"][0]
-        self._stamp, self._measurement = column["stamp"], column["measurement_id"]
-        self.range_mm: NDArray[np.uint32] = column["pixel"]["range"].T
-        self.signal: NDArray[np.uint16] = column["pixel"]["signal"].T
-        self._offsets = np.arange(COLUMNS_PER_PACKET, dtype=np.uint16)
+        layout = core.PacketFormat(sensor_info(cfg))
+        self._frame_ids = int(layout.max_frame_id) + 1
+        turn = np.tile(_template(cfg, layout), (cfg.columns // COLUMNS_PER_PACKET, 1))
+        packets = turn.view(_packet_type(cfg.rows, layout))[:, 0]
+        column = packets["column"]
+        column["measurement_id"] = np.arange(cfg.columns).reshape(-1, COLUMNS_PER_PACKET)
+        self.range_mm: NDArray[np.uint32] = column["pixel"]["range"]
+        self.signal: NDArray[np.uint16] = column["pixel"]["signal"]
+        self._frame_id, self._stamps = packets["frame_id"], column["stamp"]
+        self._unchecked = [row[:-CRC_BYTES] for row in turn]
 
-    def pack(self, frame_id: int, first_column: int, t_sensor_ns: NDArray[np.int64]) -> bytes:
-        """The packet of columns first_column to first_column + 15 of a turn, measured at t_sensor_ns (16,)."""
-        self._frame_id[0] = frame_id % (self._max_frame_id + 1)
-        self._stamp[:] = t_sensor_ns
-        self._measurement[:] = self._offsets + np.uint16(first_column)
-        self._crc[0] = self._format.calculate_crc(self._bytes)
-        return self._bytes.tobytes()
+    def pack(self, frame_id: int, packet: int, t_sensor_ns: NDArray[np.int64]) -> bytes:
+        """Packet number `packet` of a turn, its columns measured at t_sensor_ns (16,)."""
+        self._frame_id[packet] = frame_id % self._frame_ids
+        self._stamps[packet] = t_sensor_ns
+        data = self._unchecked[packet].tobytes()
+        return data + crc64.xz(data).to_bytes(CRC_BYTES, "little")
 
 
 def _template(cfg: LidarSimConfig, packet_format: Any) -> NDArray[np.uint8]:
@@ -119,12 +120,11 @@ def _packet_type(rows: int, packet_format: Any) -> np.dtype[np.void]:
             "itemsize": packet_format.col_size,
         }
     )
-    size = packet_format.lidar_packet_size
     return np.dtype(
         {
-            "names": ["frame_id", "column", "crc"],
-            "formats": ["<u2", (column, (COLUMNS_PER_PACKET,)), "<u8"],
-            "offsets": [2, packet_format.packet_header_size, size - 8],
-            "itemsize": size,
+            "names": ["frame_id", "column"],
+            "formats": ["<u2", (column, (COLUMNS_PER_PACKET,))],
+            "offsets": [2, packet_format.packet_header_size],
+            "itemsize": packet_format.lidar_packet_size,
         }
     )

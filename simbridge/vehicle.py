@@ -52,8 +52,9 @@ class Vehicle:
         self.body_id = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "vehicle"))
         self._model, self._surface, self._cfg = model, surface, cfg
         self._ground_geom = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "ground"))
-        self.position: Array = self.data.qpos[0:3]
-        self.q_world_body_wxyz: Array = self.data.qpos[3:7]
+        self.pose: Array = self.data.qpos  # position and quaternion
+        self.position: Array = self.pose[0:3]
+        self.q_world_body_wxyz: Array = self.pose[3:7]
         self.motion: Array = self.data.qvel  # velocity in world, turn rate in body
         self._near_below_z = float(surface.z.max()) + GROUND_NEAR_M
         self._wrench: Array = self.data.xfrc_applied[self.body_id]
