@@ -1,8 +1,9 @@
 """The MuJoCo model: what rays see, what the vehicle may touch, and the vehicle itself.
 
-Rays see the walls' mesh, the piles' mesh, floor and ceiling planes and the obstacles. The vehicle touches the
-obstacles, plain boxes behind the walls, and one small plane, `ground`, that is moved under it and tilted like the
-surface there: MuJoCo would take a mesh's convex hull, and its height fields are slow for rays.
+Rays see the walls (one-sided planes; a mesh where they are rough or many), the piles' mesh, floor and ceiling planes and
+the obstacles. The vehicle touches the obstacles, plain boxes behind the walls, and one small plane, `ground`, that is
+moved under it and tilted like the surface there: MuJoCo would take a mesh's convex hull, and its height fields are slow
+for rays.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ BODY_HALF_M = (0.25, 0.25, 0.05)  # arms with their guards
 FOOT_Z_M = -0.12  # lowest point of the landing gear below the centre of mass
 FOOT_RADIUS_M = 0.02
 WALL_THICKNESS_M = 0.5
+MOST_PLANES = 16  # more walls than these a mesh's tree finds faster: a plane is tried for every ray
+OVERLAP_M = 0.01  # by which a wall's plane goes on behind its neighbour, so that no ray slips through the corner
 SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open surfaces have no volume to compute inertia from
 
 
@@ -68,7 +71,11 @@ def _add_hall(spec: Any, world: WorldConfig, surface: Surface) -> None:
     if fp.signed_area(corners) < 0.0:
         corners = corners[::-1]
     low = float(surface.floor.min()) - 1.0
-    _add_mesh(spec, "walls", *meshes.walls(corners, low, world.height_m + 0.5, world.wall_roughness))
+    top = world.height_m + 0.5
+    if world.wall_roughness.rms_m > 0.0 or len(corners) > MOST_PLANES:
+        _add_mesh(spec, "walls", *meshes.walls(corners, low, top, world.wall_roughness))
+    else:
+        _add_wall_planes(spec, corners, low, top)
     middle = fp.outline(world.footprint).centroid
     floor = _add_geom(spec.worldbody, "floor", mujoco.mjtGeom.mjGEOM_PLANE, SEEN)
     floor.size, floor.pos = [0.0, 0.0, 1.0], [middle.x, middle.y, 0.0]
@@ -83,6 +90,26 @@ def _add_hall(spec: Any, world: WorldConfig, surface: Surface) -> None:
         wall.size = [math.dist(a, b) / 2, half, (world.height_m - low) / 2]
         wall.pos = [middle_xy[0], middle_xy[1], (world.height_m + low) / 2]
         wall.quat = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+
+
+def _add_wall_planes(spec: Any, corners: Array, foot_z: float, top_z: float) -> None:
+    """A plane for each wall of a counter-clockwise polygon, facing inwards: a third of a mesh's time for each ray.
+
+    At an outer corner a plane goes on a little behind its neighbour; at an inner one that would be inside the hall.
+    """
+    along = np.roll(corners, -1, axis=0) - corners
+    length = np.hypot(along[:, 0], along[:, 1])
+    before = np.roll(along, 1, axis=0)
+    beyond = np.where(before[:, 0] * along[:, 1] - before[:, 1] * along[:, 0] > 0.0, OVERLAP_M, 0.0)  # at each corner
+    for i, a in enumerate(corners):
+        first, last = -beyond[i], length[i] + beyond[(i + 1) % len(corners)]
+        middle = a + along[i] / length[i] * (first + last) / 2.0
+        yaw = math.atan2(along[i, 1], along[i, 0])
+        wall = _add_geom(spec.worldbody, f"face {i}", mujoco.mjtGeom.mjGEOM_PLANE, SEEN)
+        wall.size = [(last - first) / 2.0, (top_z - foot_z) / 2.0, 1.0]
+        wall.pos = [middle[0], middle[1], (foot_z + top_z) / 2.0]
+        back, up = yaw + math.pi, math.sqrt(0.5)  # x back along the wall, y up, so z inwards
+        wall.quat = [up * math.cos(back / 2), up * math.cos(back / 2), up * math.sin(back / 2), up * math.sin(back / 2)]
 
 
 def _add_obstacle(spec: Any, obstacle: fp.Obstacle) -> None:

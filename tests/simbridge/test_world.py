@@ -142,6 +142,28 @@ def test_no_ray_leaves_the_hall(roughness: float) -> None:
         assert off.max() < 1e-6
 
 
+@pytest.mark.parametrize("footprint", [None, [[0, 0], [0, 20], [20, 20], [20, 8], [9, 8], [9, 0]]])
+def test_rays_meet_planes_where_they_would_meet_the_mesh_of_the_walls(
+    footprint: list[list[float]] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Corners clockwise in the second: either order is allowed."""
+    rays = np.random.default_rng(3).normal(size=(20_000, 3))
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    seen = []
+    for most_planes in (16, 0):
+        monkeypatch.setattr("simbridge.model.MOST_PLANES", most_planes)
+        world = build(**({"footprint": footprint} if footprint else {}))
+        distance, normals, geom = np.zeros(20_000), np.zeros(60_000), np.zeros(20_000, dtype=np.int32)
+        mujoco.mj_multiRay(
+            world.model, world.new_data(), np.array([5.0, 6.0, 4.0]), rays.ravel(), RAY_GROUPS, 1, -1, geom, distance,
+            normals, 20_000, 1e3,
+        )  # fmt: skip
+        seen.append((distance, np.abs(np.sum(rays * normals.reshape(-1, 3), axis=1))))
+    (planes, plane_cosines), (mesh, mesh_cosines) = seen
+    assert np.abs(planes - mesh).max() < 1e-5
+    assert np.abs(plane_cosines - mesh_cosines).max() < 1e-5
+
+
 def test_clearance_counts_walls_obstacles_ceiling_and_piles_but_not_the_floor() -> None:
     column = {"center": [8, 6], "radius_m": 0.5}
     box = {"center": [4, 10], "size_m": [2, 2, 1]}
