@@ -51,7 +51,7 @@ class Obstacle:
 
 
 def table(standing: tuple[Obstacle, ...]) -> Array:
-    """(N, 9) for the kernel `nearest_obstacle`: x, y, half sizes, cosine and sine of the yaw, foot, 1 if round."""
+    """(N, 9) for the kernel `nearness.obstacle`: x, y, half sizes, cosine and sine of the yaw, foot, 1 if round."""
     rows = [
         (*o.center, *o.half_m, math.cos(o.yaw_rad), math.sin(o.yaw_rad), o.foot_z, float(o.is_round)) for o in standing
     ]

@@ -209,30 +209,12 @@ def _triangle(z: Array, x0: float, y0: float, cell_m: float, x: float, y: float)
     return a + u * along + v * across, along / cell_m, across / cell_m
 
 
-def _nearest_obstacle(table: Array, x: float, y: float, z: float) -> float:
-    """Distance to the nearest of the obstacles, 0 inside one, infinite without any; rows: see `footprint.table`."""
-    nearest = math.inf
-    for i in range(table.shape[0]):
-        cx, cy, hx, hy, hz, cos, sin, foot, is_round = table[i]
-        dx, dy = x - cx, y - cy
-        above = max(abs(z - foot - hz) - hz, 0.0)
-        if is_round > 0.0:
-            beside = max(math.sqrt(dx * dx + dy * dy) - hx, 0.0)
-        else:
-            along = max(abs(cos * dx + sin * dy) - hx, 0.0)
-            across = max(abs(-sin * dx + cos * dy) - hy, 0.0)
-            beside = math.sqrt(along * along + across * across)
-        nearest = min(nearest, math.sqrt(beside * beside + above * above))
-    return nearest
-
-
 rotation = njit(cache=True)(_rotation)
 rotors = njit(cache=True)(_rotors)
 inertial = njit(cache=True)(_inertial)
 aim = njit(cache=True)(_aim)
 returns = njit(cache=True)(_returns)
 triangle = njit(cache=True)(_triangle)
-nearest_obstacle = njit(cache=True)(_nearest_obstacle)
 
 
 def warm_up() -> None:
@@ -242,7 +224,6 @@ def warm_up() -> None:
     inertial(q, q, v, v, 0.004, 9.81, np.zeros(6))
     aim(np.ones((1, 1, 3)), 0, 1, 0.0, 0.0, np.ones(7), np.ones(7), v, z3, np.zeros(3), np.zeros((1, 3)), np.zeros(3))
     triangle(np.zeros((2, 2)), 0.0, 0.0, 1.0, 0.0, 0.0)
-    nearest_obstacle(np.zeros((1, 9)), 0.0, 0.0, 0.0)
     image = np.zeros((2, 16, 2), dtype=[("range", "<u4"), ("signal", "<u2")])  # strided, as in a packet
     returns(
         np.ones(1), np.ones(3), np.ones(3), np.zeros((1, 3)), 0, 1, np.zeros((1, 1)), np.zeros((1, 1, 3)), np.zeros(8),

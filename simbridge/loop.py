@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simbridge import footprint as fp
-from simbridge import kernels
+from simbridge import kernels, nearness
 from simbridge.config import SimConfig, StartCircle
 from simbridge.faults import SensorFaults
 from simbridge.lidar import Lidar
@@ -61,6 +61,7 @@ class Simulation:
         """step_ns: what `step` moves time by, at most 5 ms. commands_per_step: how often in it the flight controller
         gets sensors and gives motor commands; 1 suits PX4, ArduCopter wants more than 720 a second."""
         kernels.warm_up()
+        nearness.warm_up()
         self.world: World = build_world(cfg.world, cfg.vehicle)
         self.start: tuple[float, float, float] = start_pose(cfg)
         self.t_ns = BOOT_NS

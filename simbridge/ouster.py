@@ -93,7 +93,7 @@ class PacketWriter:
         """Packet number `packet` of a turn, its columns measured at t_sensor_ns (16,)."""
         self._frame_id[packet] = frame_id % self._frame_ids
         self._stamps[packet] = t_sensor_ns
-        data = self._unchecked[packet].tobytes()
+        data: bytes = self._unchecked[packet].tobytes()
         return data + crc64.xz(data).to_bytes(CRC_BYTES, "little")
 
 

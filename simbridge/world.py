@@ -10,11 +10,10 @@ import mujoco
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from simbridge import footprint as fp
+from simbridge import nearness
 from simbridge.config import VehicleConfig, WorldConfig
-from simbridge.kernels import nearest_obstacle
 from simbridge.model import build_model
 from simbridge.surface import Surface, build_surface, volume_m3
 
@@ -78,34 +77,37 @@ class World:
 
         To a pile: to the nearest corner of its triangles, so at most (cell^2 / 4 d) too much at distance d.
         """
-        x, y, z = (float(v) for v in point_world)
-        place = shapely.Point(x, y)
-        to_wall = float(self._walls.distance(place)) if shapely.contains(self.footprint, place) else 0.0
-        nearest = min(to_wall, max(self.height_m - z, 0.0), float(nearest_obstacle(self._obstacle_table, x, y, z)))
-        if self._pile_tree is not None:
-            distance, _ = self._pile_tree.query(point_world, distance_upper_bound=nearest)
-            is_inside = self.surface.height(x, y) >= z and self._is_pile(x, y)
-            nearest = 0.0 if is_inside else min(nearest, float(distance))
-        return nearest
+        x, y, z = point_world.tolist()
+        beside = min(nearness.wall(self._wall_ring, x, y), nearness.obstacle(self._obstacle_table, x, y, z))
+        nearest = min(beside, max(self.height_m - z, 0.0))
+        if self._is_pile is None:
+            return float(nearest)
+        surface = self.surface
+        return float(nearness.pile(surface.z, surface.floor, self._is_pile, self._grid, x, y, z, nearest))
 
     @cached_property
     def _obstacle_table(self) -> Array:
         return fp.table(self.obstacles)
 
     @cached_property
-    def _walls(self) -> Any:
-        shapely.prepare(self.footprint)
-        shapely.prepare(self.footprint.exterior)
-        return self.footprint.exterior
+    def _wall_ring(self) -> Array:
+        return np.array(self.footprint.exterior.coords, dtype=np.float64)
 
     @cached_property
-    def _pile_tree(self) -> Any:
-        vertices, _ = self.surface.triangles()
-        inside = shapely.contains_xy(self.footprint, vertices[:, 0], vertices[:, 1])
-        return cKDTree(vertices[inside]) if inside.any() else None
+    def _grid(self) -> Array:
+        return np.array([self.surface.x0, self.surface.y0, self.surface.cell_m])
 
-    def _is_pile(self, x: float, y: float) -> bool:
-        return self.surface.height(x, y) > self.surface.bare_height(x, y) + 0.02
+    @cached_property
+    def _is_pile(self) -> NDArray[np.bool_] | None:
+        """(ny, nx): which corners of the surface belong to material inside the walls. None: there is none."""
+        surface, has = self.surface, self.surface.cells_with_material()
+        corners = np.zeros(surface.z.shape, dtype=np.bool_)
+        for part in (corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]):
+            part |= has
+        iy, ix = np.nonzero(corners)
+        x, y = surface.x0 + ix * surface.cell_m, surface.y0 + iy * surface.cell_m
+        corners[iy, ix] = shapely.contains_xy(self.footprint, x, y)
+        return corners if corners.any() else None
 
 
 def widest_wall_distance_m(config: WorldConfig) -> float:
