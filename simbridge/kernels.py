@@ -29,8 +29,8 @@ def _rotors(
     commands: Array,
     states: Array,
     sites: Array,
-    quat: Array,
-    velocity: Array,
+    pose: Array,
+    motion: Array,
     wind: Array,
     params: Array,
     wrench: Array,
@@ -38,7 +38,7 @@ def _rotors(
     """Rotor lag, thrust law, reaction torque and drag: writes force and torque (6,) in `world`; total thrust, N.
 
     commands, states: (4,) 0..1; states are updated; a command that is no number counts as 0.
-    sites: (4, 3) x, y (FLU) and torque per thrust about body z.
+    sites: (4, 3) x, y (FLU) and torque per thrust about body z. pose (7,), motion (6,): of MuJoCo's free joint.
     params: share of the step that the lag lets through, Tmax, curve c, drag. T = Tmax ((1 - c) u + c u^2).
     """
     through, max_thrust, curve, drag = params[0], params[1], params[2], params[3]
@@ -56,18 +56,20 @@ def _rotors(
         ty -= sites[i, 0] * thrust
         tz += sites[i, 2] * thrust
     r = np.empty((3, 3))
-    rotation(quat, r)
+    rotation(pose[3:7], r)
     for k in range(3):
-        wrench[k] = r[k, 2] * total - drag * (velocity[k] - wind[k])
+        wrench[k] = r[k, 2] * total - drag * (motion[k] - wind[k])
         wrench[3 + k] = r[k, 0] * tx + r[k, 1] * ty + r[k, 2] * tz
     return total
 
 
-def _inertial(q0: Array, q1: Array, v0: Array, v1: Array, step_s: float, gravity: float, out: Array) -> None:
+def _inertial(before: Array, pose: Array, v1: Array, step_s: float, gravity: float, out: Array) -> None:
     """Means over a step, FRD, from the states at both ends: specific force into out[0:3], turn rate into out[3:6].
 
-    v: (6,) MuJoCo's free joint: velocity in `world`, turn rate in body (FLU).
+    before: (13,) pose and motion at the beginning; pose (7,), v1 (6,) at the end. Motion is that of MuJoCo's free joint:
+    velocity in `world`, turn rate in body (FLU).
     """
+    q0, v0, q1 = before[3:7], before[7:13], pose[3:7]
     q = q0 + q1 if q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3] >= 0.0 else q0 - q1
     q = q / math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
     r = np.empty((3, 3))
@@ -219,9 +221,9 @@ triangle = njit(cache=True)(_triangle)
 
 def warm_up() -> None:
     """Compile (or load from the cache) every kernel for the types that the loop gives."""
-    q, v, z3 = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(6), np.zeros(3)
-    rotors(np.zeros(4), np.zeros(4), np.zeros((4, 3)), q, v, z3, np.zeros(4), np.zeros(6))
-    inertial(q, q, v, v, 0.004, 9.81, np.zeros(6))
+    v, z3 = np.zeros(6), np.zeros(3)
+    rotors(np.zeros(4), np.zeros(4), np.zeros((4, 3)), np.ones(7), v, z3, np.zeros(4), np.zeros(6))
+    inertial(np.ones(13), np.ones(7), v, 0.004, 9.81, np.zeros(6))
     aim(np.ones((1, 1, 3)), 0, 1, 0.0, 0.0, np.ones(7), np.ones(7), v, z3, np.zeros(3), np.zeros((1, 3)), np.zeros(3))
     triangle(np.zeros((2, 2)), 0.0, 0.0, 1.0, 0.0, 0.0)
     image = np.zeros((2, 16, 2), dtype=[("range", "<u4"), ("signal", "<u2")])  # strided, as in a packet

@@ -63,7 +63,9 @@ class Vehicle:
         self._sites = np.array([[a, -a, -r], [-a, a, -r], [a, a, r], [-a, -a, r]])
         through = 1.0 - math.exp(-model.opt.timestep / cfg.rotor_lag_s)
         self._params = np.array([through, cfg.max_thrust_n, cfg.thrust_curve, cfg.drag_nspm])
+        self._full_thrust_n = 4.0 * cfg.max_thrust_n
         self._rotors = np.zeros(4)
+        self._before = np.zeros(13)  # pose and motion before the step
         self._draught = Draught(wind, seed, step_s)
         self.inertial_frd = np.zeros(6)
         self.thrust_ratio = 0.0
@@ -74,22 +76,14 @@ class Vehicle:
         commands = np.asarray(controls, dtype=np.float64)
         wind = self._draught.step()
         self._move_ground()
-        before_q, before_v = self.q_world_body_wxyz.copy(), self.motion.copy()
+        pose, motion, before = self.pose, self.motion, self._before
+        before[:7], before[7:] = pose, motion
         thrust = 0.0
         for _ in range(self._substeps):
-            thrust = rotors(
-                commands,
-                self._rotors,
-                self._sites,
-                self.q_world_body_wxyz,
-                self.motion,
-                wind,
-                self._params,
-                self._wrench,
-            )
+            thrust = rotors(commands, self._rotors, self._sites, pose, motion, wind, self._params, self._wrench)
             mujoco.mj_step(self._model, self.data)
-        self.thrust_ratio = thrust / (4.0 * self._cfg.max_thrust_n)
-        inertial(before_q, self.q_world_body_wxyz, before_v, self.motion, self._step_s, GRAVITY_MPS2, self.inertial_frd)
+        self.thrust_ratio = thrust / self._full_thrust_n
+        inertial(before, pose, motion, self._step_s, GRAVITY_MPS2, self.inertial_frd)
 
     @property
     def has_contact(self) -> bool:

@@ -65,6 +65,7 @@ class Controller:
 
     def reset(self) -> None:
         """Forget integrals and filters; hover thrust back to MPC_THR_HOVER."""
+        self._resting = False
         self.memory[:] = 0.0
         self.memory[k.Q_SP] = 1.0
         self._load()
@@ -82,17 +83,22 @@ class Controller:
 
     def idle(self) -> None:
         """Armed on the ground: motors at idle, nothing integrates."""
+        self._rest(ARMED_IDLE)
+
+    def stop(self) -> None:
+        """Disarmed."""
+        self._rest(0.0)
+
+    def _rest(self, motors: float) -> None:
         self.memory[k.FLYING] = 0.0
+        if self._resting and self.motors[0] == motors:
+            return
+        self._resting = True
         self.memory[k.VEL_INT : k.VEL_INT + 3] = 0.0
         self.memory[k.RATE_INT : k.RATE_INT + 3] = 0.0
         self.memory[k.THRUST : k.THRUST + 3] = 0.0
         self.memory[k.COLLECTIVE] = 0.0
-        self.motors[:] = ARMED_IDLE
-
-    def stop(self) -> None:
-        """Disarmed."""
-        self.idle()
-        self.motors[:] = 0.0
+        self.motors[:] = motors
 
     def limits(self, up_mps: float, down_mps: float, tilt_deg: float, is_flying: bool) -> None:
         """Limits of the vertical velocity (up may be negative during the take-off ramp) and of the tilt."""
@@ -105,6 +111,7 @@ class Controller:
         """One step of the cascade on the newest estimate; dt_position 0: only attitude and rates."""
         if self._version != self._params.version:
             self._load()
+        self._resting = False
         k.control_step(o, self.setpoint, self.memory, self._gains, self.motors, dt, dt_position)
 
     def learn_hover(self, acceleration_down_mps2: float, dt: float) -> None:
