@@ -144,15 +144,19 @@ def _returns(
     params: Array,
     row_index: NDArray[np.int64],
     first: int,
+    t_turn_ns: int,
+    per_s: int,
+    stamps: NDArray[np.uint64],
     range_mm: NDArray[np.uint32],
     signal: NDArray[np.uint16],
 ) -> None:
-    """What the sensor makes of the rays of some columns: writes into range_mm, signal (packets, 16, rows) of a turn.
+    """What the sensor makes of the rays of some columns: writes into the packets of a turn, stamps (packets, 16) in ns,
+    range_mm and signal (packets, 16, rows).
 
     Of the rays (distance, normals, rays, shifts: columns one after the other) those of `count` columns from `offset` on;
-    they are the columns from `first` on of the turn. distance: from the common origin, negative where nothing was hit.
-    noise: (columns, rows) standard normal. chance: (columns, rows, 3) uniform, for dust, its place, and loss. Both are a
-    whole turn's. params: see `lidar.py`.
+    they are the columns from `first` on of the turn, which began at t_turn_ns with per_s columns a second. distance:
+    from the common origin, negative where nothing was hit. noise: (columns, rows) standard normal. chance: (columns,
+    rows, 3) uniform, for dust, its place, and loss. Both are a whole turn's. params: see `lidar.py`.
     """
     sigma, low, high = params[0], params[1], params[2]
     grazing_cos, dropout, dust_per_m, lost, bias = params[3], params[4], params[5], params[6], params[7]
@@ -162,6 +166,7 @@ def _returns(
         at = offset + c
         column = first + c
         packet, into = column // width, column % width
+        stamps[packet, into] = t_turn_ns + column * 1_000_000_000 // per_s
         for i in range(rows):
             n = at * rows + i
             m = 3 * n
@@ -226,8 +231,10 @@ def warm_up() -> None:
     inertial(np.ones(13), np.ones(7), v, 0.004, 9.81, np.zeros(6))
     aim(np.ones((1, 1, 3)), 0, 1, 0.0, 0.0, np.ones(7), np.ones(7), v, z3, np.zeros(3), np.zeros((1, 3)), np.zeros(3))
     triangle(np.zeros((2, 2)), 0.0, 0.0, 1.0, 0.0, 0.0)
-    image = np.zeros((2, 16, 2), dtype=[("range", "<u4"), ("signal", "<u2")])  # strided, as in a packet
+    # strided, as in a packet
+    column = np.zeros((2, 16), dtype=[("stamp", "<u8"), ("pixel", [("range", "<u4"), ("signal", "<u2")], (2,))])
+    pixel = column["pixel"]
     returns(
         np.ones(1), np.ones(3), np.ones(3), np.zeros((1, 3)), 0, 1, np.zeros((1, 1)), np.zeros((1, 1, 3)), np.zeros(8),
-        np.zeros(1, dtype=np.int64), 0, image["range"], image["signal"],
+        np.zeros(1, dtype=np.int64), 0, 0, 1, column["stamp"], pixel["range"], pixel["signal"],
     )  # fmt: skip

@@ -47,8 +47,7 @@ class Lidar:
         self._noise = np.zeros((cfg.columns, len(self._rows)))
         self._chance = np.zeros((cfg.columns, len(self._rows), 3))
         self._params = _parameters(cfg)
-        packets = cfg.columns // COLUMNS_PER_PACKET
-        self._stamps = self._t_ns(np.arange(cfg.columns)).reshape(packets, COLUMNS_PER_PACKET) + self._clock_offset_ns
+        self._packets_per_turn = cfg.columns // COLUMNS_PER_PACKET
         most = self._per_s * step_ns // NS + 2  # columns of the longest step
         self._shifts, self._origin = np.zeros((most, 3)), np.zeros(3)
         self._rays, self._normals = np.zeros(3 * most * len(self._rows)), np.zeros(3 * most * len(self._rows))
@@ -80,16 +79,12 @@ class Lidar:
         while column < end:
             into = column % self._columns
             count = min(end - column, self._columns - into)
-            self._receive(into, count, column - first)
+            self._receive(into, count, column - first, column // self._columns)
             column += count
         packets = [self._pack(n) for n in range(first // COLUMNS_PER_PACKET, end // COLUMNS_PER_PACKET)]
         if self._loss_ratio > 0.0:
             packets = [packet for packet in packets if self._loss_rng.random() >= self._loss_ratio]
         return packets
-
-    def _t_ns(self, column: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Simulated time of a column."""
-        return self._began_ns + column * NS // self._per_s
 
     def _shoot(self, first: int, count: int, t_middle_ns: int, before: Array, pose: Array, motion: Array) -> None:
         """One mj_multiRay for the columns of a step, all from the pose's origin, each in its own direction."""
@@ -104,20 +99,22 @@ class Lidar:
             self._geom[:n], self._distance[:n], self._normals[: 3 * n], n, CUTOFF_M,
         )  # fmt: skip
 
-    def _receive(self, first: int, count: int, offset: int) -> None:
+    def _receive(self, first: int, count: int, offset: int, turn: int) -> None:
         """Noise and losses on `count` columns of this step's rays, into the packets of the turn that is being filled."""
         if first == 0:
             self._noise_rng.standard_normal(out=self._noise)
             self._chance_rng.random(out=self._chance)
+        writer = self._writer
+        t_turn_ns = self._began_ns + self._clock_offset_ns + turn * self._turn_ns
         returns(
             self._distance, self._normals, self._rays, self._shifts, offset, count, self._noise, self._chance,
-            self._params, self._rows, first, self._writer.range_mm, self._writer.signal,
+            self._params, self._rows, first, t_turn_ns, self._per_s, writer.stamps, writer.range_mm, writer.signal,
         )  # fmt: skip
 
     def _pack(self, number: int) -> bytes:
         """The packet of this number, counted from the first turn's first."""
-        turn, packet = divmod(number, len(self._stamps))
-        return self._writer.pack(turn, packet, self._stamps[packet] + turn * self._turn_ns)
+        turn, packet = divmod(number, self._packets_per_turn)
+        return self._writer.pack(turn, packet)
 
 
 def _parameters(cfg: LidarSimConfig) -> Array:

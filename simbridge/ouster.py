@@ -72,9 +72,9 @@ def directions_sensor(cfg: LidarSimConfig) -> Array:
 class PacketWriter:
     """Lidar packets of COLUMNS_PER_PACKET columns each, as they are measured.
 
-    Fill range_mm (packets of a turn, 16, rows) uint32, below 2^19, and signal (the same) uint16 and call `pack`.
-    ouster-sdk packs whole frames only, and slowly: this has it pack one packet, whose changing parts are then
-    overwritten in place (a test packs the same by the SDK).
+    Fill stamps (packets of a turn, 16) uint64, in ns of the sensor's clock, range_mm (packets, 16, rows) uint32, below
+    2^19, and signal (the same) uint16 and call `pack`. ouster-sdk packs whole frames only, and slowly: this has it pack
+    one packet, whose changing parts are then overwritten in place (a test packs the same by the SDK).
     """
 
     def __init__(self, cfg: LidarSimConfig) -> None:
@@ -86,13 +86,13 @@ class PacketWriter:
         column["measurement_id"] = np.arange(cfg.columns).reshape(-1, COLUMNS_PER_PACKET)
         self.range_mm: NDArray[np.uint32] = column["pixel"]["range"]
         self.signal: NDArray[np.uint16] = column["pixel"]["signal"]
-        self._frame_id, self._stamps = packets["frame_id"], column["stamp"]
+        self.stamps: NDArray[np.uint64] = column["stamp"]
+        self._frame_id = packets["frame_id"]
         self._unchecked = [row[:-CRC_BYTES] for row in turn]
 
-    def pack(self, frame_id: int, packet: int, t_sensor_ns: NDArray[np.int64]) -> bytes:
-        """Packet number `packet` of a turn, its columns measured at t_sensor_ns (16,)."""
+    def pack(self, frame_id: int, packet: int) -> bytes:
+        """Packet number `packet` of a turn."""
         self._frame_id[packet] = frame_id % self._frame_ids
-        self._stamps[packet] = t_sensor_ns
         data: bytes = self._unchecked[packet].tobytes()
         return data + crc64.xz(data).to_bytes(CRC_BYTES, "little")
 
