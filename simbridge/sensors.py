@@ -53,27 +53,27 @@ class Imu:
     def __init__(self, cfg: ImuConfig, seed: int, step_ns: int = STEP_NS) -> None:
         accel_density, gyro_density = NOISE_DENSITY[cfg.part]
         bandwidth = math.sqrt(0.5e9 / step_ns)  # white noise averaged over a step
-        self._sigma = (
-            np.array([*(d * GRAVITY_MPS2 for d in accel_density), *(math.radians(gyro_density),) * 3]) * bandwidth
-        )
+        sigma = np.array([*(d * GRAVITY_MPS2 for d in accel_density), *(math.radians(gyro_density),) * 3]) * bandwidth
         shake = (cfg.vibration_mps2,) * 3 + (math.radians(cfg.vibration_dps),) * 3
-        self._vibration = np.array(shake) if any(shake) else None
+        self._shakes = any(shake)
         bias = stream(seed, "imu bias").standard_normal(6)
         ideal = cfg.part == "ideal"
-        self._bias = bias * np.array(
+        offset = bias * np.array(
             [0.0 if ideal else cfg.accel_bias_mps2] * 3 + [0.0 if ideal else math.radians(cfg.gyro_bias_dps)] * 3
         )
         turn = matrix_from_rpy(np.radians(cfg.misalignment_rpy_deg)).T
         self._turn = np.kron(np.eye(2), turn) if any(cfg.misalignment_rpy_deg) else None
-        self._normals = Normals(stream(seed, "imu"), 12)
+        self._errors = Normals(
+            stream(seed, "imu"), 12, np.concatenate([sigma, shake]), np.concatenate([offset, np.zeros(6)])
+        )
 
     def sample(self, truth: Array, thrust_ratio: float) -> ImuSample:
         """truth: (6,) specific force and turn rate of the airframe, FRD. thrust_ratio: 0..1, for vibration."""
-        normals = self._normals.draw()
+        errors = self._errors.draw()
         felt = truth if self._turn is None else self._turn @ truth
-        felt = felt + self._bias + self._sigma * normals[:6]
-        if self._vibration is not None:
-            felt = felt + thrust_ratio * self._vibration * normals[6:]
+        felt = felt + errors[:6]
+        if self._shakes:
+            felt += thrust_ratio * errors[6:]
         return ImuSample(accel_frd_mps2=felt[:3], gyro_frd_radps=felt[3:])
 
 

@@ -16,16 +16,27 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 class Normals:
-    """Standard normal vectors of one width, drawn in blocks: a draw a step would cost more than the physics."""
+    """Normal vectors of one width, drawn in blocks: a draw a step would cost more than the physics."""
 
-    def __init__(self, rng: np.random.Generator, width: int) -> None:
-        self._rng, self._width = rng, width
-        self._block, self._next = rng.standard_normal((BLOCK, width)), 0
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        width: int,
+        sigma: NDArray[np.float64] | float = 1.0,
+        mean: NDArray[np.float64] | float = 0.0,
+    ) -> None:
+        """sigma, mean: of each component."""
+        self._rng, self._width, self._sigma, self._mean = rng, width, sigma, mean
+        self._refill()
 
     def draw(self) -> NDArray[np.float64]:
         """(width,), not to be changed by the caller."""
         if self._next == BLOCK:
-            self._block, self._next = self._rng.standard_normal((BLOCK, self._width)), 0
+            self._refill()
         row: NDArray[np.float64] = self._block[self._next]
         self._next += 1
         return row
+
+    def _refill(self) -> None:
+        self._block = self._mean + self._sigma * self._rng.standard_normal((BLOCK, self._width))
+        self._next = 0
