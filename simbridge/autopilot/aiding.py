@@ -287,16 +287,8 @@ class VisionAiding:
     ) -> bool:
         """Fuse all components or, if one fails its gate, none."""
         ekf = self._ekf
-        x, P = ekf.x, ekf.P
-        aid.ratio = max(
-            (value - x[first + 1 + i]) ** 2 / (gate**2 * (P[first + i, first + i] + variances[i]))
-            for i, value in enumerate(measured)
-        )
-        if not allowed or aid.ratio > 1.0:
-            return False
-        for i, value in enumerate(measured):
-            kernels.fuse_state(x, P, first + i, value - x[first + 1 + i], variances[i])
-        return True
+        aid.ratio = kernels.gate_and_fuse(ekf.x, ekf.P, first, measured, tuple(variances), gate, allowed)
+        return allowed and not aid.ratio > 1.0
 
     def _reset(self, first: int, values: tuple[float, ...], variances: list[float]) -> None:
         for i, value in enumerate(values):

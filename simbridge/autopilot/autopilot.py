@@ -52,6 +52,8 @@ def warm_up() -> None:
     for _ in range(2):
         kernels.imu_step(x, P, o, acc, ring_imu, ring_out, 0, rest, still, STEP_S, ones)
     kernels.fuse_state(x, P, 3, 0.0, 1.0)
+    for count in (1, 2, 3):
+        kernels.gate_and_fuse(x, P, 3, (0.0,) * count, (1.0,) * count, 1.0, True)
     kernels.fuse_yaw(x, P, 0.0, kernels.yaw_variance(x, P))
     kernels.reset_block(P, 6, 1, 1.0)
     kernels.shift_output(o, ring_out, np.zeros(6))

@@ -149,6 +149,32 @@ def fuse_state(x: Array, P: Array, index: int, innovation: float, variance: floa
     _inject(x, P, gain, innovation)
 
 
+@njit(cache=True, error_model="numpy")  # a gate of 0 refuses all, it does not raise
+def gate_and_fuse(
+    x: Array,
+    P: Array,
+    first: int,
+    measured: tuple[float, ...],
+    variances: tuple[float, ...],
+    gate: float,
+    allowed: bool,
+) -> float:
+    """Fuse direct measurements of the error states from `first` on or, if one fails its gate or it is not allowed, none.
+
+    Returns: the worst innovation against its gate, squared: fused if allowed and at most 1.
+    """
+    worst = 0.0
+    for i in range(len(measured)):
+        innovation = measured[i] - x[first + 1 + i]
+        ratio = innovation**2 / (gate**2 * (P[first + i, first + i] + variances[i]))
+        if i == 0 or ratio > worst:
+            worst = ratio
+    if allowed and not worst > 1.0:
+        for i in range(len(measured)):
+            fuse_state(x, P, first + i, measured[i] - x[first + 1 + i], variances[i])
+    return worst
+
+
 @njit(cache=True)
 def yaw_row(x: Array) -> tuple[float, float]:
     """Derivatives of heading by rotation about north and east; by rotation about down it is 1."""

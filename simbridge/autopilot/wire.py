@@ -29,6 +29,7 @@ class Layout:
     struct: Struct
     slots: dict[str, tuple[int, int]]
     is_text: frozenset[str]
+    is_flat: bool = False  # nothing but scalars
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,15 @@ def _layout(cls: Any) -> Layout:
             count = 0  # one `Ns` item
         slots[name] = (at, count)
         at += max(count, 1)
-    return Layout(cls.id, cls.msgname, bytes([cls.crc_extra]), cls.unpacker, slots, frozenset(texts))
+    return Layout(
+        cls.id,
+        cls.msgname,
+        bytes([cls.crc_extra]),
+        cls.unpacker,
+        slots,
+        frozenset(texts),
+        len(slots) == at and not texts,
+    )
 
 
 LAYOUTS: dict[int, Layout] = {msgid: _layout(cls) for msgid, cls in development.mavlink_map.items()}
@@ -63,6 +72,8 @@ def _fields(layout: Layout, payload: bytes) -> dict[str, Any]:
     if len(payload) < size:  # MAVLink 2 cuts trailing zeros
         payload = payload + bytes(size - len(payload))
     values = layout.struct.unpack_from(payload)
+    if layout.is_flat:
+        return dict(zip(layout.slots, values, strict=True))
     fields: dict[str, Any] = {}
     for name, (first, count) in layout.slots.items():
         value: Any = values[first : first + count] if count else values[first]
