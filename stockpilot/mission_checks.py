@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from simbridge.config import SimConfig  # the emulated side is an extra: on a vehicle it need not be there
 
 NAME = re.compile(r"(?!\.)[\w][\w .-]*")
-LEVEL_DEG = 5.0  # 1 m off the height of flight at 12 m
+LEVEL_DEG = 15.0  # so steep a layer meets the floor 34 m off, flying at 9 m: walls are still seen
 BELOW_CEILING_M = 1.5
 ABOVE_MATERIAL_M = 1.0
 BELOW_TOP_M = 0.5  # what rises by less above the height of flight is too small a target for the level scan
@@ -103,7 +103,7 @@ def companion_checks(companion: CompanionConfig, teller: Teller) -> Iterator[str
     if max(abs(angle) for angle in lidar.mount_rpy_deg[:2]) > LEVEL_DEG:
         yield teller.say(
             ("lidar", "mount_rpy_deg"), lidar.mount_rpy_deg,
-            f"roll and pitch must be within {LEVEL_DEG:g} deg, else no layer is level (the yaw is free)",
+            f"roll and pitch must be within {LEVEL_DEG:g} deg, else the level layer sees floor and ceiling (the yaw is free)",
         )  # fmt: skip
     if nav.height_m >= guard.max_height_m:
         yield teller.say(
