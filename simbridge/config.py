@@ -14,6 +14,8 @@ from simbridge import footprint as fp
 from simbridge.piles import Pile
 from simbridge.section import Finite, NonNegative, Point, Positive, Ratio, Section, Vector, refuse
 
+MIN_THRUST_TO_WEIGHT = 1.3  # less does not climb and steer at once
+
 
 class Circle(Section):
     center: Point
@@ -86,10 +88,13 @@ class Roughness(Section):
     seed: int = Field(0, ge=0)
 
 
+Breeze = Annotated[float, Field(ge=-15, le=15, allow_inf_nan=False)]
+
+
 class Wind(Section):
     """Draught through the store: a mean and gusts (first-order Gauss-Markov in each axis)."""
 
-    mean_mps: Vector = Field((0.0, 0.0, 0.0), description="world axes")
+    mean_mps: tuple[Breeze, Breeze, Breeze] = Field((0.0, 0.0, 0.0), description="world axes")
     gust_mps: NonNegative = Field(
         0.0, le=10, description="standard deviation of each horizontal axis; half of it upwards"
     )
@@ -187,6 +192,14 @@ class VehicleConfig(Section):
     imu: ImuConfig = ImuConfig()
     barometer: BarometerConfig = BarometerConfig()
     rangefinder: RangefinderConfig = RangefinderConfig()
+
+    @model_validator(mode="after")
+    def _can_fly(self) -> Self:
+        lightest = MIN_THRUST_TO_WEIGHT * 9.81 * self.mass_kg / 4.0
+        if self.max_thrust_n < lightest:
+            reason = f"must be at least {lightest:.1f} for a vehicle of {self.mass_kg:g} kg"
+            refuse(("max_thrust_n",), self.max_thrust_n, f"{reason}: {MIN_THRUST_TO_WEIGHT:g} times its weight")
+        return self
 
 
 class Dust(Section):

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 VEHICLE_RADIUS_M = 0.4  # rotor hub at 0.28 m and half a 10 inch propeller
 MIN_START_TO_WALL_M = 1.0
+MAX_CELLS = 4_000_000  # of the height grid over the hall: 400 x 400 m at the default cell
+MIN_HEADROOM_M = 2.0  # between the floor at its highest and the ceiling
+TOP_GRID = 200  # a pile's peak is looked for on so many places each way
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,6 +165,7 @@ def check_world(world: WorldConfig) -> None:
             f"crosses or touches itself, or is too small ({reason}); allowed is a simple polygon: "
             "corners in order along the wall, no edge crossing another",
         )
+    _check_size(world, hall)
     count = len(corners(world.footprint))
     for i, spec in enumerate(world.pilasters):
         if spec.wall != "all" and not 0 <= spec.wall < count:
@@ -169,6 +173,56 @@ def check_world(world: WorldConfig) -> None:
     _check_obstacles(world, hall)
     for i, pile in enumerate(world.piles):
         _check_pile(("piles", i), pile, hall)
+        top, shown = pile_top_z(world, pile), pile.model_dump(exclude_defaults=True)
+        if top == -math.inf:
+            refuse(("piles", i), shown, "holds no material within the walls")
+        if top >= world.height_m:
+            reason = f"its top at {top:.4g} m reaches the ceiling at {world.height_m:g} m; it must be lower"
+            refuse(("piles", i), shown, reason)
+
+
+def _check_size(world: WorldConfig, hall: Any) -> None:
+    """Raises: ValidationError: a corner given twice, too large to compute, or a floor that meets the ceiling."""
+    points = corners(world.footprint)
+    for i, (point, following) in enumerate(zip(points, np.roll(points, -1, axis=0), strict=True)):
+        if math.dist(point, following) < 0.01:
+            reason = f"corners {i} and {(i + 1) % len(points)} stand at the same place; each may be given once"
+            refuse(("footprint",), world.footprint, reason)
+    low_x, low_y, high_x, high_y = hall.bounds
+    cells = (high_x - low_x) * (high_y - low_y) / world.pile_cell_m**2
+    if cells > MAX_CELLS:
+        spans = f"spans {high_x - low_x:g} x {high_y - low_y:g} m"
+        reason = f"{spans}: more than {MAX_CELLS} cells of pile_cell_m {world.pile_cell_m:g}; make it smaller or those larger"
+        refuse(("footprint",), world.footprint, reason)
+    highest = highest_floor_z(world)
+    if highest > world.height_m - MIN_HEADROOM_M:
+        reason = f"the floor rises to {highest:.1f} m; at least {MIN_HEADROOM_M:g} m below the ceiling are needed"
+        refuse(("floor_slope",), world.floor_slope, reason)
+
+
+def highest_floor_z(world: WorldConfig) -> float:
+    """Of the bare floor, at one of the corners."""
+    points = corners(world.footprint)
+    return float(np.max(floor_z(world, points[:, 0], points[:, 1])))
+
+
+def pile_top_z(world: WorldConfig, pile: piles.Pile) -> float:
+    """Height of a pile's peak within the walls, `world`; minus infinity where it has no material."""
+    hall = outline(world.footprint)
+    low_x, low_y, high_x, high_y = piles.outline(pile).buffer(piles.ragged_m(pile)).intersection(hall).bounds
+    x, y = np.meshgrid(np.linspace(low_x, high_x, TOP_GRID), np.linspace(low_y, high_y, TOP_GRID))
+    inside = shapely.contains_xy(hall, x.ravel(), y.ravel())
+    x, y = x.ravel()[inside], y.ravel()[inside]
+    top = piles.top_z(pile, x, y, lambda a, b: floor_z(world, a, b))
+    material = top > floor_z(world, x, y)
+    return float(np.max(top[material])) if material.any() else -math.inf
+
+
+def start_floor_z(world: WorldConfig, start: Start) -> tuple[float, float]:
+    """Lowest and highest floor where the flight may begin, `world`."""
+    (x, y), radius = (start[:2], 0.0) if isinstance(start, tuple) else (start.circle.center, start.circle.radius_m)
+    z, rise = float(floor_z(world, np.array(x), np.array(y))), radius * math.hypot(*world.floor_slope)
+    return z - rise, z + rise
 
 
 def _check_obstacles(world: WorldConfig, hall: Any) -> None:

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Floor = Callable[[Array, Array], Array]
 
 FOOT_M = 0.05  # the tail of a gaussian that is lower counts as swept floor
+MESH_WANTED = "expected a mesh that trimesh reads (stl, obj, ply, off, glb)"
 FUNCTIONS: dict[str, Any] = {
     "abs": np.abs,
     "atan2": np.arctan2,
@@ -139,7 +140,12 @@ class MeshPile(_Pile):
     @classmethod
     def _can_be_read(cls, path: Path) -> Path:
         if not path.is_file():
-            raise ValueError(f"no such file: {path}; expected a mesh that trimesh reads (stl, obj, ply, off, glb)")
+            raise ValueError(f"no such file: {path}; {MESH_WANTED}")
+        triangles = _mesh_triangles(path)
+        if len(triangles) == 0 or not np.all(np.isfinite(triangles)):
+            raise ValueError(f"holds no triangles with finite corners; {MESH_WANTED}")
+        if float(triangles[:, :, 2].max()) <= 0.0:
+            raise ValueError("lies below z = 0 everywhere: the mesh's origin stands on the floor, z up")
         return path
 
 
@@ -226,6 +232,8 @@ def compile_expression(text: str) -> Callable[[Array, Array], Array]:
         tree = ast.parse(text, mode="eval")
     except SyntaxError as error:
         raise ValueError(f"not an expression: {error.msg}") from None
+    except (ValueError, RecursionError, MemoryError) as error:  # a NUL, or brackets thousands deep
+        raise ValueError(f"not an expression: {error}") from None
     for node in ast.walk(tree):
         if isinstance(node, ast.Name) and node.id not in FUNCTIONS and node.id not in ("x", "y", "pi"):
             raise ValueError(f"unknown name {node.id!r}; allowed are x, y, pi, {', '.join(sorted(FUNCTIONS))}")
@@ -235,20 +243,47 @@ def compile_expression(text: str) -> Callable[[Array, Array], Array]:
             raise ValueError(f"only numbers are allowed, not {node.value!r}")
         if not isinstance(node, ALLOWED_NODES):
             raise ValueError(f"{type(node).__name__} is not allowed; allowed is arithmetic and the named functions")
+        if isinstance(node, ast.Constant):  # whole numbers of Python grow without end: 9**9**9**9
+            node.value = _as_float(node.value)
     code = compile(tree, "<pile>", "eval")
     names = {"__builtins__": {}, "pi": math.pi, **FUNCTIONS}
-    return lambda x, y: np.asarray(eval(code, names, {"x": x, "y": y}), dtype=np.float64)
+
+    def height(x: Array, y: Array) -> Array:
+        with np.errstate(all="ignore"):
+            return np.asarray(eval(code, names, {"x": x, "y": y}), dtype=np.float64)
+
+    try:
+        height(np.array([0.5, 1.5]), np.array([0.5, 1.5])) + np.zeros(2)
+    except Exception as error:  # whatever the expression makes numpy raise
+        raise ValueError(f"cannot be computed: {error}") from None
+    return height
+
+
+def _as_float(value: object) -> float:
+    assert isinstance(value, int | float)
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError(f"the number is too large: {str(value)[:20]}...") from None
 
 
 def _placed_mesh(pile: MeshPile) -> Array:
     """(N, 3, 3) triangles of the file in `world`, height above the floor."""
-    import trimesh  # slow to import, and seldom wanted
-
-    mesh: Any = trimesh.load(pile.file, force="mesh")
-    triangles = np.asarray(mesh.triangles, dtype=np.float64) * pile.scale
+    triangles = _mesh_triangles(pile.file) * pile.scale
     c, s = math.cos(math.radians(pile.yaw_deg)), math.sin(math.radians(pile.yaw_deg))
     turned = triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return np.asarray(turned + np.array([*pile.center, 0.0]))
+
+
+def _mesh_triangles(path: Path) -> Array:
+    """(N, 3, 3) triangles as the file says. Raises: ValueError: not a mesh."""
+    import trimesh  # slow to import, and seldom wanted
+
+    try:
+        mesh: Any = trimesh.load(path, force="mesh")
+    except Exception as error:  # a broken file makes its readers raise whatever they like
+        raise ValueError(f"cannot be read as a mesh ({type(error).__name__}: {error}); {MESH_WANTED}") from None
+    return np.asarray(mesh.triangles, dtype=np.float64).reshape(-1, 3, 3)
 
 
 def upper_surface(triangles: Array, x: Array, y: Array) -> Array:

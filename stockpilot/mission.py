@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
@@ -14,16 +13,25 @@ from pydantic import BaseModel, ValidationError
 
 from companion.config import CompanionConfig, LidarConfig
 from companion.errors import ConfigError
+from stockpilot.mission_checks import (
+    Location,
+    Teller,
+    companion_checks,
+    dotted,
+    label_checks,
+    truth_values_as_numbers,
+    world_checks,
+)
 
-if TYPE_CHECKING:  # the emulated side is an extra: on a vehicle it need not be there
-    from simbridge.config import SimConfig
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+    from simbridge.config import SimConfig  # the emulated side is an extra: on a vehicle it need not be there
 
 LABELS = ("name", "description")
 SIM_SECTIONS = ("seed", "world", "vehicle", "autopilot", "faults")
 COMPANION_SECTIONS = tuple(k for k in CompanionConfig.model_fields if k != "lidar")
 SECTIONS = (*LABELS, *SIM_SECTIONS, "lidar", *COMPANION_SECTIONS)
-
-Location = tuple[str | int, ...]
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -82,10 +90,11 @@ def build_mission(
 ) -> Mission:
     """A mission from its parsed sections. Raises: ConfigError."""
     problems: list[str] = []
-    teller = _Teller(source, lines or {})
+    teller = Teller(source, lines or {})
     for key in raw:
         if key not in SECTIONS:
             problems.append(teller.unknown((key,), raw[key], SECTIONS))
+    problems += label_checks(raw, teller)
     lidar = raw.get("lidar") or {}
     if not isinstance(lidar, dict):
         problems.append(teller.say(("lidar",), lidar, "must be a section of keys and values"))
@@ -94,8 +103,11 @@ def build_mission(
     flies["lidar"] = {k: v for k, v in lidar.items() if k in LidarConfig.model_fields}
     companion = _validate(CompanionConfig, flies, raw, teller, problems)
     if companion is not None:
-        problems += _companion_checks(companion, teller)
+        problems += companion_checks(companion, teller)
+        problems += truth_values_as_numbers(raw, companion.model_dump(), teller)
     sim = _emulated_side(raw, lidar, companion, teller, problems) if with_world else None
+    if sim is not None:
+        problems += truth_values_as_numbers(raw, sim.model_dump(), teller)
     if problems or companion is None:
         raise ConfigError("\n".join(dict.fromkeys(problems)))
     return Mission(
@@ -108,7 +120,7 @@ def _emulated_side(
     raw: dict[str, Any],
     lidar: dict[str, Any],
     companion: CompanionConfig | None,
-    teller: _Teller,
+    teller: Teller,
     problems: list[str],
 ) -> SimConfig | None:
     """The sections of simbridge, checked also against those that fly; None where the mission has no world."""
@@ -119,6 +131,9 @@ def _emulated_side(
     if raw.get("world") is None:
         if any(raw.get(k) is not None for k in ("vehicle", "faults")):
             problems.append(teller.say(("world",), None, "is missing: a vehicle or faults to emulate need a world"))
+        seed = raw.get("seed")
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+            problems.append(teller.say(("seed",), seed, "must be a whole number, 0 or greater"))
         return None
     if any(": lidar" in problem for problem in problems):
         return None  # the emulated side would only say the same again
@@ -128,106 +143,57 @@ def _emulated_side(
     emulated["lidar"] = {k: v for k, v in {**shared, **lidar}.items() if k in LidarSimConfig.model_fields}
     sim = _validate(SimConfig, emulated, raw, teller, problems)
     if companion is not None and sim is not None and not problems:
-        problems += _world_checks(companion, sim, teller)
+        problems += world_checks(companion, sim, teller)
     return sim
 
 
-def _companion_checks(companion: CompanionConfig, teller: _Teller) -> Iterator[str]:
-    nav, guard, lidar = companion.navigator, companion.guard, companion.lidar
-    if lidar.min_range_m >= lidar.max_range_m:
-        yield teller.say(
-            ("lidar", "min_range_m"), lidar.min_range_m, f"must be below max_range_m {lidar.max_range_m:g}"
-        )
-    if lidar.elevation_min_deg >= lidar.elevation_max_deg:
-        yield teller.say(
-            ("lidar", "elevation_min_deg"), lidar.elevation_min_deg,
-            f"must be below elevation_max_deg {lidar.elevation_max_deg:g}",
-        )  # fmt: skip
-    if nav.wall_distance_m <= guard.stop_distance_m + 1.0:
-        yield teller.say(
-            ("navigator", "wall_distance_m"), nav.wall_distance_m,
-            f"must exceed guard.stop_distance_m {guard.stop_distance_m:g} by more than 1 m: the guard would stop the lap",
-        )  # fmt: skip
-    if nav.wall_distance_m >= lidar.max_range_m:
-        yield teller.say(
-            ("navigator", "wall_distance_m"), nav.wall_distance_m,
-            f"must be below lidar.max_range_m {lidar.max_range_m:g}: the wall would not be seen",
-        )  # fmt: skip
-    if nav.height_m >= guard.max_height_m:
-        yield teller.say(
-            ("navigator", "height_m"), nav.height_m, f"must be below guard.max_height_m {guard.max_height_m:g}"
-        )
-    if nav.forward_speed_mps > guard.max_speed_mps:
-        yield teller.say(
-            ("navigator", "forward_speed_mps"), nav.forward_speed_mps,
-            f"must be at most guard.max_speed_mps {guard.max_speed_mps:g}",
-        )  # fmt: skip
-
-
-def _world_checks(companion: CompanionConfig, sim: SimConfig, teller: _Teller) -> Iterator[str]:
-    nav = companion.navigator
-    if nav.height_m > sim.world.height_m - 1.5:
-        yield teller.say(
-            ("navigator", "height_m"), nav.height_m,
-            f"must be at most {sim.world.height_m - 1.5:g}: 1.5 m below the ceiling at {sim.world.height_m:g} m",
-        )  # fmt: skip
-    from simbridge.world import widest_wall_distance_m
-
-    widest = widest_wall_distance_m(sim.world)
-    if nav.wall_distance_m >= widest:
-        yield teller.say(
-            ("navigator", "wall_distance_m"), nav.wall_distance_m,
-            f"must be below {math.floor(widest * 10) / 10:g}: half the clear width of the hall, "
-            "else no path keeps that distance from every wall",
-        )  # fmt: skip
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-
-
-class _Teller:
-    """Words a fault: file and line, key, value, what is allowed."""
-
-    def __init__(self, source: str, lines: Mapping[Location, int]) -> None:
-        self._source = source
-        self._lines = lines
-
-    def say(self, location: Location, value: object, allowed: str) -> str:
-        where = self._source
-        for n in range(len(location), 0, -1):
-            if location[:n] in self._lines:
-                where = f"{self._source}:{self._lines[location[:n]]}"
-                break
-        shown = "" if value is None else f" = {_shorten(value)}"
-        return f"{where}: {_dotted(location)}{shown}: {allowed}"
-
-    def unknown(self, location: Location, value: object, allowed: Sequence[str]) -> str:
-        near = difflib.get_close_matches(str(location[-1]), allowed, n=1, cutoff=0.5)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        return self.say(location, value, f"unknown key{hint}; allowed here: {', '.join(allowed)}")
-
-
 def _validate(
-    model: type[Model], data: dict[str, Any], raw: dict[str, Any], teller: _Teller, problems: list[str]
+    model: type[Model], data: dict[str, Any], raw: dict[str, Any], teller: Teller, problems: list[str]
 ) -> Model | None:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        for fault in error.errors():
-            location = _real_location(tuple(fault["loc"]), raw)
+        faults = error.errors()
+        places = [tuple(fault["loc"]) for fault in faults]
+        for fault, place in zip(faults, places, strict=True):
+            if fault["type"] == "too_short" and any(len(p) > len(place) and p[: len(place)] == place for p in places):
+                continue  # too short only because an entry is at fault, which is told by itself
+            location = _real_location(place, raw)
             if fault["type"] == "extra_forbidden":
-                problems.append(
-                    teller.unknown(location, fault["input"], _allowed_keys(model, tuple(fault["loc"])[:-1]))
-                )
+                problems.append(teller.unknown(location, fault["input"], _allowed_keys(model, place[:-1])))
             else:
-                shown = None if fault["type"] == "missing" else fault["input"]
-                problems.append(teller.say(location, shown, _plain(fault["msg"])))
+                problems.append(_worded(fault, location, teller))
         return None
+
+
+def _worded(fault: ErrorDetails, location: Location, teller: Teller) -> str:
+    context = fault.get("ctx", {})
+    match fault["type"]:
+        case "missing":
+            return teller.say(location, None, "is missing")
+        case "union_tag_not_found":
+            return teller.say(
+                (*location, "kind"), None, "is missing; allowed are cone, ridge, gaussians, function, mesh"
+            )
+        case "union_tag_invalid":
+            return teller.say((*location, "kind"), context["tag"], f"must be one of {context['expected_tags']}")
+        case "too_short" | "too_long":
+            least = "at least" if fault["type"] == "too_short" else "at most"
+            count = context.get("min_length", context.get("max_length"))
+            return teller.say(
+                location, fault["input"], f"must be a list of {least} {count}, not {context['actual_length']}"
+            )
+        case "tuple_type" | "list_type":
+            return teller.say(location, fault["input"], "must be a list")
+        case "model_type" | "model_attributes_type" | "dict_type":
+            return teller.say(location, fault["input"], "must be a section of keys and values")
+        case _:
+            return teller.say(location, fault["input"], _plain(fault["msg"]))
 
 
 def _plain(message: str) -> str:
     message = message.removeprefix("Value error, ").removeprefix("Assertion failed, ")
-    return message.replace("Input should be", "must be").replace("Field required", "is missing")
+    return message.replace("Input should be", "must be")
 
 
 def _real_location(location: Location, raw: object) -> Location:
@@ -273,15 +239,6 @@ def _models_in(annotation: object) -> list[type[BaseModel]]:
     return [model for argument in get_args(annotation) for model in _models_in(argument)]
 
 
-def _dotted(location: Location) -> str:
-    return ".".join(str(part) for part in location) or "(file)"
-
-
-def _shorten(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
 def _read_yaml(path: Path) -> tuple[dict[str, Any], dict[Location, int]]:
     try:
         text = path.read_text(encoding="utf-8")
@@ -294,12 +251,15 @@ def _read_yaml(path: Path) -> tuple[dict[str, Any], dict[Location, int]]:
     try:
         raw = yaml.safe_load(text)
         node = yaml.compose(text, Loader=yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: is not YAML: {error}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date that is none; brackets thousands deep
+        raise ConfigError(f"{path}: is not YAML: {' '.join(str(error).split())}") from None
     if not isinstance(raw, dict):
         raise ConfigError(f"{path}: expected sections ({', '.join(SECTIONS)}), got {type(raw).__name__}")
     lines: dict[Location, int] = {}
-    _collect_lines(node, (), lines, path)
+    try:
+        _collect_lines(node, (), lines, path)
+    except RecursionError:
+        raise ConfigError(f"{path}: holds itself: an alias (*) stands within its own anchor (&)") from None
     return raw, lines
 
 
@@ -309,7 +269,7 @@ def _collect_lines(node: yaml.Node | None, location: Location, lines: dict[Locat
         for key, value in node.value:
             here = (*location, str(key.value))
             if str(key.value) in seen:
-                raise ConfigError(f"{path}:{key.start_mark.line + 1}: {_dotted(here)}: given twice")
+                raise ConfigError(f"{path}:{key.start_mark.line + 1}: {dotted(here)}: given twice")
             seen.add(str(key.value))
             lines[here] = key.start_mark.line + 1
             _collect_lines(value, here, lines, path)
@@ -326,8 +286,8 @@ def parse_setting(setting: str) -> tuple[Location, Any]:
         raise ConfigError(f"--set {setting}: expected key=value, for example --set navigator.height_m=8")
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {setting}: the value is not YAML: {error}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"--set {setting}: the value is not YAML: {' '.join(str(error).split())}") from None
     location = tuple(int(part) if part.isdigit() else part for part in key.strip().split("."))
     return location, value
 
@@ -343,9 +303,9 @@ def _apply_setting(raw: dict[str, Any], setting: str) -> None:
                 here[part] = {}
             here = here[part]
         else:
-            raise ConfigError(f"--set {setting}: {_dotted(location[: n + 1])} is not in the mission")
+            raise ConfigError(f"--set {setting}: {dotted(location[: n + 1])} is not in the mission")
     last: Any = location[-1]
     if isinstance(here, dict) or (isinstance(here, list) and isinstance(last, int) and last < len(here)):
         here[last] = value
     else:
-        raise ConfigError(f"--set {setting}: {_dotted(location[:-1])} is not a section that has keys")
+        raise ConfigError(f"--set {setting}: {dotted(location[:-1])} is not a section that has keys")

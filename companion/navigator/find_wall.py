@@ -30,6 +30,9 @@ TRIED_DEG = 5
 
 TOO_NEAR_M = 0.5  # nearer than D by this: back off first
 FACING_RAD = math.radians(5)
+ROOM_STEPS_M = (1.6, 0.8)  # so far off the room is tried; half the longer one is less than any start's room
+MIN_GAIN = 0.25  # of the step: less is a place in the middle, or the noise
+MAX_LOSS_M = 0.1  # on the way, of the room there is
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +75,7 @@ class WallFinder:
             self.phase = Phase.LOOK
             return
         if self.phase in (Phase.LOOK, Phase.RETREAT):
-            self._make_room(view, pose, around, wall)
+            self._make_room(view, pose, standing, around, wall)
         if self.phase is Phase.LOOK:
             self._choose(view, pose, standing)
         elif self.phase is Phase.APPROACH:
@@ -99,24 +102,27 @@ class WallFinder:
             return self._steer(min(speed_mps, max(0.05, brake)), 0.0, turn)
         return self._steer(0.0, 0.0, 0.0)
 
-    def _make_room(self, view: ScanView, pose: Pose2, around: tuple[float, float], wall: tuple[float, float]) -> None:
+    def _make_room(
+        self, view: ScanView, pose: Pose2, standing: NDArray[np.bool_], around: tuple[float, float],
+        wall: tuple[float, float],
+    ) -> None:  # fmt: skip
         """Back off from a wall nearer than D, from anything else nearer than a lane; one may then be at the wall."""
         retreating = self.phase is Phase.RETREAT
-        lack = self._cfg.wall_distance_m - (0.2 if retreating else TOO_NEAR_M) - wall[0]
-        crowd = self._lane - (0.0 if retreating else 0.3) - around[0]
-        if lack <= 0.0 and crowd <= 0.0:
+        to_wall = self._cfg.wall_distance_m - (0.2 if retreating else TOO_NEAR_M)
+        to_other = self._lane - (0.0 if retreating else 0.3)
+        lack = max(to_wall - wall[0], to_other - around[0])
+        if lack <= 0.0:
             self.phase = Phase.LOOK
             if retreating and wall[0] < self._cfg.wall_distance_m + TOO_NEAR_M:
                 self._found(view, wall[1])
             return
-        near = around if crowd > 0.0 else wall
-        room, _ = view.ahead(near[1] + math.pi, 0.5 * self._lane, 0.5 * self._lane)
-        if room < max(near[0], self._lane) + 0.3:  # as near on the other side
+        bearing = roomier(view, standing, to_wall, to_other)
+        if bearing is None:  # as near on the other side
             self._found(view, wall[1])
             return
         self.phase = Phase.RETREAT
-        self._away_yaw = wrap_angle(pose.yaw + near[1] + math.pi)
-        self._lack_m = max(lack, crowd)
+        self._away_yaw = wrap_angle(pose.yaw + bearing)
+        self._lack_m = lack
 
     def _choose(self, view: ScanView, pose: Pose2, standing: NDArray[np.bool_]) -> None:
         bearing = wall_bearing(view, self._lane, standing)
@@ -132,6 +138,31 @@ class WallFinder:
 
     def _steer(self, forward: float, left: float, yaw_rate: float) -> Steering:
         return Steering(forward, left, yaw_rate, False, None, self._front_m)
+
+
+def roomier(view: ScanView, standing: NDArray[np.bool_], to_wall_m: float, to_other_m: float) -> float | None:
+    """Body bearing in which most room is gained; None in the middle of a narrow place.
+
+    Of the wanted room, to_wall_m to walls and to_other_m to anything, as much is lacking as at its worst place: out of
+    a corner the way is between the walls, not straight off the nearer one, and between two columns across their line.
+    """
+    seen = np.isfinite(view.smooth_m)
+    things = view.smooth_m[seen, None] * DIRECTION[seen]
+    wanted = np.where(standing[seen], to_other_m, max(to_wall_m, to_other_m))
+    lacking = float(np.max(wanted - view.smooth_m[seen]))
+    for step_m in ROOM_STEPS_M:
+        halfway, there = (_lacking_at(things, wanted, 0.5 * step_m), _lacking_at(things, wanted, step_m))
+        there = np.where(halfway < lacking + MAX_LOSS_M, there, np.inf)
+        best = int(np.argmin(there))
+        if lacking - float(there[best]) > MIN_GAIN * step_m:
+            return float(BEARING_RAD[best * TRIED_DEG])
+    return None
+
+
+def _lacking_at(things: Array, wanted: Array, step_m: float) -> Array:
+    """(72,) the room lacking after a step in each of the tried bearings. things (N, 2), wanted (N,)."""
+    off = things[None, :, :] - step_m * DIRECTION[::TRIED_DEG, None, :]
+    return np.asarray(np.max(wanted[None, :] - np.hypot(off[:, :, 0], off[:, :, 1]), axis=1))
 
 
 def wall_bearing(view: ScanView, lane_m: float, standing: NDArray[np.bool_]) -> float | None:

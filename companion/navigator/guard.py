@@ -137,6 +137,7 @@ class Guard:
         armed = inputs.vehicle is not None and inputs.vehicle.is_armed
         if armed and not self._was_armed and self._estimate is not None:
             self._start = self._estimate.position_map_m
+            self._surroundings.take_off(float(self._start[0]), float(self._start[1]))
         self._was_armed = armed
         walls = inputs.walls
         if walls is None or not self._poses or not _is_new(walls, self._walls, t_ns):

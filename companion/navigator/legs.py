@@ -16,7 +16,7 @@ from companion.navigator.motion import STILL, Motion, climb_rate, steered, towar
 from companion.navigator.route import Path, Route
 from companion.navigator.scan_view import Wall
 from companion.navigator.situation import Situation
-from companion.navigator.wall_follower import WallFollower
+from companion.navigator.wall_follower import Pose2, WallFollower
 
 AT_HEIGHT_M = 0.15
 HEIGHT_KEEPING_MPS = 0.4
@@ -47,6 +47,9 @@ class Start:
     @property
     def place(self) -> tuple[float, float]:
         return self.x, self.y
+
+    def is_far(self, pose: Pose2, cfg: NavigatorConfig) -> bool:
+        return math.hypot(pose.x - self.x, pose.y - self.y) > cfg.max_distance_from_start_m
 
 
 Flown = tuple[Motion, Ending | None]

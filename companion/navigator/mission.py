@@ -160,6 +160,8 @@ class Navigator:
         self._check_battery()
         if self.state in OUTWARD and now.since_s(self._armed_ns) > self._cfg.max_flight_time_s:
             self._go_home("time_limit", f"flown for {self._cfg.max_flight_time_s:g} s", only_flown=False)
+        if self.state in OUTWARD and self._start is not None and self._start.is_far(now.pose, self._cfg):
+            self._go_home("too_far", "the way leads farther from the start than the mission allows", only_flown=True)
         if self.state in OUTWARD and now.vision.lasting_degenerate_s > DEGENERATE_TURN_BACK_S:
             self._go_home("degenerate", "the geometry has not held the position for 20 s", only_flown=True)
         if not now.vision.is_good and self.state not in (S.HOLDING, S.LAND):
@@ -249,9 +251,9 @@ class Navigator:
         self._path.add(self._now.pose)
         motion, ending = self._leg.step(self._now)
         if ending is Ending.ARRIVED:
-            self._round = Round(self._config, self._start)
-            self._round.begin(self._leg.wall, self._now)
-            self._leg = self._round
+            wall = self._leg.wall
+            self._leg = self._round = Round(self._config, self._start)
+            self._leg.begin(wall, self._now)
             self._go(S.FOLLOW, "at the wall")
         elif ending is Ending.FAILED:
             self._go_home("no_wall", "no way to a wall was found", only_flown=False)
@@ -269,9 +271,7 @@ class Navigator:
                 self._go_home("completed", "all laps flown", only_flown=False)
         elif ending is Ending.ISLAND:
             self._islands = (*self._islands, self._leg.island())
-            self._notes.tell(
-                Severity.INFO, "island", "went round something that stands free: looking for the hall's wall"
-            )
+            self._notes.tell(Severity.INFO, "island", "went round a thing that stands free: looking for the wall")
             if len(self._islands) > MAX_ISLANDS:
                 self._go_home("no_wall", "only free-standing things were found", only_flown=False)
             else:

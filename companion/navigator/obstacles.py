@@ -17,6 +17,8 @@ WAY_SECTORS = 12  # to each side of the motion: as wide as the vehicle at 2.5 m
 BLIND_SECTORS = 5  # so many in a row unknown in the way: something could hide there
 LONG_AGO_NS = -(10**15)
 MIN_SEEN = 18  # returns all round: with fewer nothing is seen at all
+HOME_MARGIN_M = 0.2  # error of the position since: may come so much nearer to a thing than the place of take-off is
+AIRFRAME_M = 0.6  # never nearer to anything than the tips of the rotors reach, and a little
 
 
 def allowed_speed(room_m: Array | float, deceleration_mps2: float) -> Array:
@@ -35,6 +37,14 @@ class Surroundings:
         self._places = np.full((SECTORS, 2), np.inf)
         self._place_ns = np.full(SECTORS, LONG_AGO_NS, dtype=np.int64)  # when the place was measured
         self._looked_ns = np.full(SECTORS, LONG_AGO_NS, dtype=np.int64)  # when anybody looked there
+        self._home: Array | None = None  # (2,) where it took off, map
+        self._home_stop = stop_distance_m
+
+    def take_off(self, x: float, y: float) -> None:
+        """From here: it stood there and will land there, however near things are to that place."""
+        self._home = np.array([x, y])
+        nearest = float(np.hypot(self._places[:, 0] - x, self._places[:, 1] - y).min()) - HOME_MARGIN_M
+        self._home_stop = min(self._stop, max(nearest, AIRFRAME_M))
 
     def see(self, walls: WallRanges, x: float, y: float, yaw: float) -> None:
         """Take in a scan and the pose it was taken at."""
@@ -67,11 +77,22 @@ class Surroundings:
         distance = np.hypot(off[:, 0], off[:, 1])
         near = fresh & (distance < reach)  # only what is so near can limit this speed
         direction = off[near] / np.maximum(distance[near], 1e-9)[:, None]
-        limit = allowed_speed(distance[near] - self._stop, self._deceleration)
+        limit = allowed_speed(distance[near] - self._stop_at(self._places[near]), self._deceleration)
         velocity, why = _slide(velocity_xy, direction, limit)
         if velocity.any() and self._is_blind(velocity, t_ns):
             return np.zeros(2), "nobody looked that way"
         return velocity, why
+
+    def _stop_at(self, places: Array) -> Array | float:
+        """How near each place (N, 2) may come: the stop distance, or as near as it is to where we took off.
+
+        So a start by a wall can be left and come back to, and nothing else is passed any nearer. What came to stand
+        there meanwhile may come no nearer than the nearest thing was at take-off.
+        """
+        if self._home is None or self._home_stop >= self._stop:
+            return self._stop
+        from_home = np.hypot(places[:, 0] - self._home[0], places[:, 1] - self._home[1])
+        return np.asarray(np.clip(from_home - HOME_MARGIN_M, self._home_stop, self._stop))
 
     def _is_blind(self, velocity: Array, t_ns: int) -> bool:
         centre = round(math.degrees(math.atan2(float(velocity[1]), float(velocity[0]))))

@@ -9,7 +9,7 @@ import pytest
 
 from companion.config import CompanionConfig
 from companion.navigator import NavigatorState as S
-from tests.companion.navigator.halls import HALLS, MS, Hall, Rig, rectangle
+from tests.companion.navigator.halls import HALLS, MS, Hall, Rig, circle, column, rectangle
 
 # hall, speed, seed of the start: each hall, each speed; more seeds by sweeping this with a wider range.
 FLIGHTS = [
@@ -40,6 +40,40 @@ def test_a_lap_closes_from_any_start_and_ends_where_it_began(hall, speed, seed):
     assert round_the_hall
     if hall in ("cement_store", "l_shaped", "silo"):
         assert rig.wall_distance_rms_m() < 0.1
+
+
+# A hall, a start in it where nothing is 2 m away, D, and what is nearest: each 1.1 m off.
+TIGHT = {
+    "corner": ([rectangle(0, 0, 16, 12)], (1.1, 1.1, -2.8), 4.0),
+    "wall behind": ([rectangle(0, 0, 16, 12)], (1.1, 6.0, 0.0), 4.0),
+    "wall ahead": ([rectangle(0, 0, 16, 12)], (8.0, 10.9, 1.6), 4.0),
+    "inner corner": ([[(0, 0), (18, 0), (18, 9), (9, 9), (9, 17), (0, 17)]], (8.2, 9.9, 3.5), 3.6),
+    "round wall": ([circle(8, 8, 8)], (8.0, 1.1, 0.2), 4.0),
+    "between columns": ([rectangle(0, 0, 18, 14), column(7.5, 4.4), column(10.5, 4.4)], (9.0, 4.4, 1.6), 4.0),
+    "sharp corner": ([[(0, 0), (22, 0), (11, 20)]], (11.0, 15.5, 0.0), 4.0),
+}
+
+
+@pytest.mark.parametrize("name", TIGHT)
+def test_a_start_nearer_than_the_guards_stop_distance_is_left_and_come_back_to(name):
+    rings, start, distance = TIGHT[name]
+    navigator = {"forward_speed_mps": 0.55, "wall_distance_m": distance, "height_m": 4.0}
+    rig = Rig(Hall(rings), start, CompanionConfig.model_validate({"navigator": navigator}))
+    end = rig.fly(900)
+    assert (end.outcome, end.lap_closed) == ("completed", True), end.reason
+    assert rig.from_start_m() < 0.3
+    assert rig.min_clearance > rig.hall.clearance(*start[:2]) - 0.25
+
+
+def test_a_way_farther_than_the_mission_allows_is_broken_off_and_leads_home():
+    config = CompanionConfig.model_validate(
+        {"navigator": {"forward_speed_mps": 0.55, "max_distance_from_start_m": 20.0, "height_m": 4.0}}
+    )
+    rig = Rig(Hall(HALLS["cement_store"]), (8.0, 8.0, 0.0), config)
+    end = rig.fly(600)
+    assert (end.outcome, end.lap_closed) == ("too_far", False)
+    assert rig.from_start_m() < 0.5
+    assert np.hypot(np.array(rig.log.x) - 8.0, np.array(rig.log.y) - 8.0).max() < 21.0
 
 
 def test_two_laps_are_two_laps_and_progress_rises_to_one():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from companion.config import CompanionConfig
 from companion.messages import FlightMode, RequestKind, SetpointKind
 from companion.navigator.guard import Guard, GuardInput
-from companion.navigator.obstacles import allowed_speed
+from companion.navigator.obstacles import HOME_MARGIN_M, allowed_speed
 from tests.companion.navigator.builders import MS, GuardRig, S, abort, estimate, setpoint, toward, vehicle, walls
 
 CFG = CompanionConfig().guard
@@ -378,6 +378,50 @@ def test_bad_ranges_are_not_taken_for_free_air(bad):
     for _ in range(10):
         verdict = rig.check(0.5, 0.0, 0.0)
     assert not verdict.setpoint.velocity_map_mps[:2].any()
+
+
+def by_a_wall(distance: float) -> np.ndarray:
+    """Ranges to an endless wall ahead (x = distance), 20 m elsewhere."""
+    cosine = np.cos(np.radians(np.arange(360)))
+    return np.where(cosine > distance / 20.0, distance / np.maximum(cosine, 1e-9), 20.0)
+
+
+def taken_off_by_a_wall(distance: float) -> GuardRig:
+    """A guard that saw the wall on the ground before it was armed."""
+    rig = GuardRig()
+    rig.guard, rig.ranges = Guard(CompanionConfig()), by_a_wall(distance)
+    for is_armed in (False, True):
+        rig.t += 100 * MS
+        rig.guard.check(None, rig.t, rig.inputs(at=(0.0, 0.0, 0.0), vehicle=vehicle(rig.t, is_armed=is_armed)))
+    return rig
+
+
+def toward_the_wall(rig: GuardRig, x: float, y: float, wall_m: float) -> float:
+    """Velocity towards it that passes at (x, y), the wall being where it was."""
+    rig.ranges = by_a_wall(wall_m - x)
+    for _ in range(12):  # what was seen from elsewhere is forgotten
+        rig.check(0.0, 0.0, 0.0, later_ms=100, at=(x, y, 5.0))
+    return float(rig.check(0.4, 0.0, 0.0, at=(x, y, 5.0)).setpoint.velocity_map_mps[0])
+
+
+def test_the_place_of_take_off_is_come_back_to_though_a_wall_is_nearer_than_the_stop_distance():
+    rig = taken_off_by_a_wall(1.2)
+    assert toward_the_wall(rig, -1.0, 0.0, 1.2) > 0.3
+    assert toward_the_wall(rig, -0.3, 0.0, 1.2) > 0.1
+    assert toward_the_wall(rig, HOME_MARGIN_M, 0.0, 1.2) < 0.01  # and no nearer
+
+
+def test_away_from_the_place_of_take_off_the_stop_distance_holds():
+    rig = taken_off_by_a_wall(1.2)
+    for y in (3.0, -5.0, 12.0):
+        assert toward_the_wall(rig, 1.2 - CFG.stop_distance_m, y, 1.2) < 0.02
+
+
+def test_what_came_to_stand_by_the_place_of_take_off_is_kept_off_as_far_as_the_nearest_thing_was():
+    rig = taken_off_by_a_wall(1.6)
+    assert toward_the_wall(rig, -1.4, 0.0, 0.0) < 0.01  # a wall now runs through the start
+    rig = taken_off_by_a_wall(5.0)  # in the open
+    assert toward_the_wall(rig, -2.0, 0.0, 0.0) < 0.01
 
 
 def test_an_obstacle_stays_where_it_is_while_the_vehicle_moves_and_turns():
