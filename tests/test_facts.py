@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ast
 import re
+from typing import get_args
 
 import pytest
+import yaml
 
+from simbridge.config import FaultConfig
 from tests.named_tests import ROOT, claims_something, functions_of, letters, named_in, rows
 from tests.shared_data import shared_data
 
@@ -71,3 +74,15 @@ def test_each_fault_has_a_test(number: int) -> None:
     for path, name in tests:
         assert name in functions_of(path), f"{path} has no {name}"
         assert claims_something(functions_of(path)[name]), f"{path}::{name} claims nothing"
+
+
+def test_each_fault_that_the_page_makes_happen_is_one_that_simbridge_knows() -> None:
+    table = SAFETY.split("\n## Made to happen\n")[1]
+    snippets = [s for cells in rows(table)[1:] for s in re.findall(r"`(\{target: [^`]*\})`", cells[1])]
+    made = [FaultConfig.model_validate(yaml.safe_load(snippet)) for snippet in snippets]
+    assert {fault.kind for fault in made} == {*get_args(FaultConfig.model_fields["kind"].annotation)}
+    targets = {*get_args(FaultConfig.model_fields["target"].annotation)}
+    assert targets - {fault.target for fault in made} <= {"baro"}
+    numbers = [int(cells[0]) for cells in rows(table)[1:]]
+    assert numbers == sorted(set(numbers))
+    assert set(numbers) < set(faults())

@@ -88,6 +88,22 @@ def test_the_autopilot_is_told_by_its_heartbeat_and_no_restart_is_imagined(autop
     assert not heard.session.vehicle_state(START_NS + 10_000 * SECOND).is_connected
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "name", "armed_s"),
+    [("px4", "ev_offboard", 55.0), ("px4", "vision_loss", 0.0), ("ardupilot", "ev_guided", 0.0)],
+)
+def test_sensors_and_battery_of_real_ones_that_flew_do_not_stand_against_arming(
+    autopilot: str, name: str, armed_s: float
+) -> None:
+    """The doctor's checks, in front of arming: what really armed must pass those that look at the vehicle itself."""
+    heard = listen(autopilot, name)
+    armed = armed_s or heard.first("armed")
+    before = [state for t, state in heard.states if armed - 2.0 < t < armed]
+    assert before
+    reasons = {reason.split(":")[0] for state in before for reason in state.not_ready_because}
+    assert not {reason for reason in reasons if reason.startswith("sensor") or reason == "origin"}
+
+
 def test_px4_ev_offboard_goes_hold_offboard_land_and_back_to_offboard_disarmed() -> None:
     """PX4.md 7: after landing and disarming the heartbeat goes back to OFFBOARD."""
     heard = listen("px4", "ev_offboard")
