@@ -23,7 +23,7 @@ def read_computer(t_ns: int, folder: Path) -> ComputerStatus:
         cpu_core_ratios=cores,
         ram_used_mib=int(memory.used // MIB),
         ram_total_mib=int(memory.total // MIB),
-        disk_used_mib=int(disk.used // MIB),
+        disk_used_mib=int((disk.total - disk.free) // MIB),  # what is kept for root is no more free than the rest
         disk_total_mib=int(disk.total // MIB),
         temperature_c=_temperature(),
     )

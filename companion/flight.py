@@ -17,6 +17,8 @@ from companion import topics
 from companion.config import CompanionConfig
 from companion.lidar.ouster import OusterDecoder
 from companion.mapping import Mapper
+from companion.mavlink.arming import in_words
+from companion.mavlink.checks import Facts, check_computer
 from companion.mavlink.computer import ComputerStatus
 from companion.mavlink.session import MavlinkSession
 from companion.mavlink.signing import Signer
@@ -28,6 +30,7 @@ from companion.messages import (
     OperatorCommand,
     OperatorCommandKind,
     RangefinderSample,
+    Setpoint,
     SetpointKind,
     Severity,
     VehicleState,
@@ -94,6 +97,8 @@ class Flight:
     _mapped_ns: int | None = field(init=False, default=None)
     _judged: OdometryEstimate | None = field(init=False, default=None)
     _below_m: float | None = field(init=False, default=None)
+    _sent: Setpoint | None = field(init=False, default=None)
+    _computer_not_ready: tuple[str, ...] = field(init=False, default=())
     _sent_odometry_ns: int | None = field(init=False, default=None)
     _odometry_beat: _Beat = field(init=False)
     _setpoint_beat: _Beat = field(init=False)
@@ -191,6 +196,10 @@ class Flight:
         """How the companion's computer fares: the ground station hears it."""
         self.record("told", status.t_ns, json.dumps(dataclasses.asdict(status)).encode(), None)
         self.session.send_computer_status(status)
+        free_gib = (status.disk_total_mib - status.disk_used_mib) / 1024
+        reserve_gib = self.config.recording.reserve_gib if self.config.recording.enabled else -1.0
+        checks = check_computer(Facts(autopilot=None, disk_free_gib=free_gib, disk_reserve_gib=reserve_gib))
+        self._computer_not_ready = in_words(checks)
 
     def on_told(self, payload: bytes, t_ns: int) -> None:
         """What `on_event` or `on_computer` recorded, again."""
@@ -239,6 +248,8 @@ class Flight:
                 vehicle=state,
                 commands=commands,
                 time_synced=self.session.time_synced,
+                not_ready_because=self._computer_not_ready,
+                sent=self._sent,
             ),
         )
         self.navigation = output
@@ -255,9 +266,9 @@ class Flight:
             self.tell(event)
         if output.setpoint is not None:
             self.tap(topics.WANTED, t_ns, output.setpoint)
-        setpoint = verdict.setpoint
+        setpoint, self._sent = verdict.setpoint, None
         if setpoint is not None and setpoint.kind is not SetpointKind.SILENT:
-            self.session.send_setpoint(setpoint)
+            self._sent = setpoint if self.session.send_setpoint(setpoint) else None
             self.tap(topics.SETPOINT, t_ns, setpoint)
 
     def _note_quality(self, estimate: OdometryEstimate) -> None:

@@ -33,6 +33,7 @@ class Probe:
     quality: int = 90
     position_sigma_m: float = 0.1
     jump_m: float = 0.0  # half way through, without reset_counter
+    is_clock_still: bool = False  # every sample with the same time_usec
 
 
 async def ensure_origin(link: VehicleLink, *, may_set: bool) -> bool:
@@ -87,12 +88,14 @@ async def send_pose(link: VehicleLink, probe: Probe, seconds: float) -> SentVisi
     }
     begin = time.monotonic()
     left: list[float] = []
+    stamps: list[int] = []
     period = 1.0 / probe.rate_hz
     while time.monotonic() - begin < seconds:
         now = time.monotonic()
         is_late_half = now - begin > seconds / 2
         x = probe.jump_m if is_late_half else 0.0
-        await link.send("ODOMETRY", {**fields, "time_usec": time.monotonic_ns() // 1000, "x": x})
+        stamps.append(stamps[0] if probe.is_clock_still and stamps else time.monotonic_ns() // 1000)
+        await link.send("ODOMETRY", {**fields, "time_usec": stamps[-1], "x": x})
         left.append(now)
         await asyncio.sleep(max(0.0, begin + len(left) * period - time.monotonic()))
     gaps = [b - a for a, b in pairwise(left)]
@@ -106,6 +109,7 @@ async def send_pose(link: VehicleLink, probe: Probe, seconds: float) -> SentVisi
         norm_error=abs(norm - 1.0),
         quality=probe.quality,
         position_sigma_m=probe.position_sigma_m,
+        stamps_forward=all(before < after for before, after in pairwise(stamps)),
     )
 
 

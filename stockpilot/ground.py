@@ -105,12 +105,14 @@ async def _abort(link: VehicleLink) -> Result:
 
 
 async def _logs(link: VehicleLink, out: Path | None, newest: int) -> Result:
-    from mavsdk.asyncio.plugins.log_files import LogFilesAsync, LogFilesError
+    from mavsdk.asyncio.plugins.log_files import LogFilesAsync, LogFilesError, LogFilesResult
 
     logs = LogFilesAsync(link.system)
     try:
         entries = list(await logs.get_entries())
     except LogFilesError as error:
+        if error.result == LogFilesResult.NO_LOGFILES:
+            return {"ok": True, "logs": []}
         return {"ok": False, "error": f"the list of logs was not given: {str(error).split(';')[0]}", "logs": []}
     entries.sort(key=lambda entry: entry.id)
     listed = [{"id": e.id, "date": e.date, "bytes": e.size_bytes} for e in entries]
@@ -151,7 +153,9 @@ def _show(result: Result) -> None:
     for key, value in result.items():
         if key in ("ok", "error"):
             continue
-        if key == "logs":
+        if key == "logs" and not value:
+            console.print("it keeps no logs")
+        elif key == "logs":
             for log in value:
                 console.print(f"{log['id']:>4}  {log['date'] or 'no date':24}  {log['bytes'] / 1e6:8.1f} MB")
         elif isinstance(value, list) and value and isinstance(value[0], float):

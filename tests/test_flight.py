@@ -65,6 +65,7 @@ def test_the_papers_pipeline_is_scored_beside_on_the_same_flight(flown: Flown) -
 
 @pytest.mark.timeout(300)
 def test_odometry_leaves_without_a_gap_that_px4_would_notice(flown: Flown) -> None:
+    """AUTOPILOTS.md: "starts only if two samples are < 200 ms apart and the newest is < 200 ms old"."""
     assert 0.0 < flown.scored.report["odometry_max_gap_s"] <= 0.2
 
 

@@ -1,10 +1,13 @@
-"""The gate before arming: each reason says what is missing and what to do about it."""
+"""The gate before arming: each reason says what is missing and what to do about it. What the doctor calls red is red
+here too: parameters, sensors, battery and origin are judged by its own checks."""
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 from companion.geometry import wrap_angle, yaw_from_quat
+from companion.mavlink.checks import Check, Facts, Verdict, check_battery, check_origin, check_sensors
 from companion.mavlink.dialect import Dialect
 from companion.mavlink.origin import Origin, OriginState
 from companion.mavlink.parameters import Parameters
@@ -37,6 +40,13 @@ def reasons_not_to_arm(
         _heartbeat(vehicle, t_ns),
         *parameters.reasons(),
         _origin(origin),
+        *_told_by_the_doctor(
+            dialect.name,
+            origin.confirmed_e7[2] if origin.confirmed_e7 is not None else None,
+            vehicle.sensors_present,
+            vehicle.sensors_health,
+            vehicle.battery_ratio,
+        ),
         timesync.missing(dialect.timesync_answers),
         _attitude(vehicle, t_ns),
         _vision_sent(vision, t_ns),
@@ -61,6 +71,29 @@ def _origin(origin: Origin) -> str | None:
     return (
         f"origin: GPS_GLOBAL_ORIGIN has not come back, sent {origin.sent} times: the autopilot's estimator is still "
         "starting, or holds a position without an origin: restart it on the ground"
+    )
+
+
+@lru_cache(maxsize=4)  # asked for at every estimate and setpoint, and seldom another answer
+def _told_by_the_doctor(
+    autopilot: str, altitude_mm: int | None, present: int | None, health: int | None, battery_ratio: float | None
+) -> tuple[str, ...]:
+    facts = Facts(
+        autopilot=autopilot,
+        has_origin=None if altitude_mm is None else True,
+        origin_altitude_m=None if altitude_mm is None else altitude_mm / 1e3,
+        sensors_present=present,
+        sensors_health=health,
+        battery_ratio=battery_ratio,
+    )
+    return in_words([*check_origin(facts), *check_sensors(facts), *check_battery(facts)])
+
+
+def in_words(checks: list[Check]) -> tuple[str, ...]:
+    """Each red line as a reason not to arm."""
+    red = [check for check in checks if check.verdict is Verdict.FAIL]
+    return tuple(
+        f"{c.name}: {c.actual}" + (f", expected {c.expected}" if c.expected else "") + f": {c.mend}" for c in red
     )
 
 

@@ -195,6 +195,7 @@ class Hearing:
     def _on_sys_status(self, payload: bytes, t_ns: int) -> None:
         fields = wire.unpack(wire.SYS_STATUS, payload)
         present, _, health = fields[:3]
+        self.vehicle.sensors_present, self.vehicle.sensors_health = present, health
         self.vehicle.prearm_ok = bool(health & _PREARM) if present & _PREARM else None
         self._note_battery(fields[12])
 

@@ -37,6 +37,8 @@ class Vehicle:
     t_position_ns: int | None = None
     battery_ratio: float | None = None
     prearm_ok: bool | None = None
+    sensors_present: int | None = None  # MAV_SYS_STATUS_SENSOR
+    sensors_health: int | None = None
     boot_ms: int | None = None
     wanted_mode: FlightMode | None = None
     pilot_has_control: bool = False

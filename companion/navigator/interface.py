@@ -51,7 +51,8 @@ FINISHED = frozenset({NavigatorState.DONE, NavigatorState.ABORTED, NavigatorStat
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NavigatorInput:
     """The newest of everything. `commands`: those that arrived since the last step. `time_synced`: the flight
-    controller's clock is known. `not_ready_because`: what else forbids arming (parameters, disk), for people."""
+    controller's clock is known. `not_ready_because`: what else forbids arming (parameters, disk), for people. `sent`:
+    the setpoint that left after the step before; None when none did."""
 
     estimate: OdometryEstimate | None
     walls: WallRanges | None
@@ -59,6 +60,7 @@ class NavigatorInput:
     commands: tuple[OperatorCommand, ...] = ()
     time_synced: bool = True
     not_ready_because: tuple[str, ...] = ()
+    sent: Setpoint | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

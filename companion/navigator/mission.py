@@ -157,6 +157,8 @@ class Navigator:
             return
         if now.vision.has_jumped:
             self._land_here("odometry_reset", "odometry began anew far from where it was: the way home is not known")
+        if now.unfollowed:
+            self._land_here("not_followed", f"the vehicle does not follow its setpoints: {now.unfollowed}")
         self._check_battery()
         if self.state in OUTWARD and now.since_s(self._armed_ns) > self._cfg.max_flight_time_s:
             self._go_home("time_limit", f"flown for {self._cfg.max_flight_time_s:g} s", only_flown=False)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from companion.config import CompanionConfig
 from companion.geometry import yaw_from_quat
-from companion.messages import OdometryEstimate, VehicleState
+from companion.messages import FlightMode, OdometryEstimate, VehicleState
+from companion.navigator.follow import FollowWatch
 from companion.navigator.interface import NavigatorInput
 from companion.navigator.scan_view import ScanView
 from companion.navigator.wall_follower import Pose2
@@ -16,7 +17,8 @@ from companion.navigator.watch import Vision, VisionWatch
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """pose, z_m: the newest good ones, map. view: of a scan not seen before, taken at view_pose; else None."""
+    """pose, z_m: the newest good ones, map. view: of a scan not seen before, taken at view_pose; else None. unfollowed:
+    why the vehicle is believed not to do what it is told; empty while it does."""
 
     t_ns: int
     vehicle: VehicleState | None
@@ -25,6 +27,7 @@ class Situation:
     z_m: float
     view: ScanView | None
     view_pose: Pose2
+    unfollowed: str = ""
 
     def since_s(self, t_ns: int | None) -> float:
         return (self.t_ns - t_ns) / 1e9 if t_ns is not None else 0.0
@@ -40,6 +43,7 @@ class Lookout:
 
     def __init__(self, config: CompanionConfig) -> None:
         self._watch = VisionWatch(config.guard, config.lidar)
+        self._follow = FollowWatch()
         self._poses: deque[tuple[int, Pose2]] = deque(maxlen=40)
         self._scan_ns = -1
         self._last = NOTHING_YET
@@ -54,7 +58,10 @@ class Lookout:
             if inputs.walls is not None and inputs.walls.t_ns > self._scan_ns:
                 self._scan_ns = inputs.walls.t_ns
                 view, view_pose = ScanView.of(inputs.walls), self._pose_at(inputs.walls.t_ns)
-        self._last = Situation(t_ns, vehicle, vision, pose, z, view, view_pose)
+        is_ours = vehicle is not None and vehicle.is_armed and vehicle.mode is FlightMode.OFFBOARD
+        estimate = inputs.estimate if vision.is_good else None
+        unfollowed = self._follow.step(t_ns, inputs.sent if is_ours else None, estimate)
+        self._last = Situation(t_ns, vehicle, vision, pose, z, view, view_pose, unfollowed)
         return self._last
 
     def _place(self, estimate: OdometryEstimate) -> tuple[Pose2, float]:

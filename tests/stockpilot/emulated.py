@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 
 import numpy as np
@@ -24,7 +25,8 @@ def free_port() -> int:
 
 
 class Standing:
-    """A context: inside it, the autopilot sends to `ground_url` as PX4 does to 14550."""
+    """A context: inside it, the autopilot sends to `ground_url` as PX4 does to 14550. alter: what becomes of each frame
+    on its way to the ground; None: lost."""
 
     def __init__(self, **params: float) -> None:
         self.autopilot = Autopilot({**PX4_VISION, **params})
@@ -33,6 +35,7 @@ class Standing:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
+        self.alter: Callable[[bytes], bytes | None] = lambda frame: frame
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -70,8 +73,9 @@ class Standing:
                 break
             self.autopilot.receive("gcs", data, t_ns)
         for link, frame in self.autopilot.take_output():
-            if link == "gcs":
+            altered = self.alter(frame) if link == "gcs" else None
+            if altered is not None:
                 try:
-                    self._socket.sendto(frame, ("127.0.0.1", self.port))
+                    self._socket.sendto(altered, ("127.0.0.1", self.port))
                 except OSError:
                     return

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 import socket
 import threading
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import pytest
 import typer
+from pymavlink.dialects.v20 import ardupilotmega as m
 from typer.testing import CliRunner
 
 from companion.mavlink.checks import Verdict, all_checks, is_green
+from companion.mavlink.manifest import PX4_MANIFEST
+from simbridge.link_frames import message_id
 from stockpilot.doctor import doctor
 from stockpilot.doctor_facts import Surroundings, _lasting, gather
 from stockpilot.doctor_params import apply_manifest
@@ -29,7 +36,52 @@ BROKEN: list[tuple[Probe, dict[str, float], str]] = [
     (Probe(quality=10), {"EKF2_EV_QMIN": 50}, "quality"),
     (Probe(position_sigma_m=50.0), {}, "covariance"),
     (Probe(jump_m=8.0), {}, "innovation"),
+    (Probe(child_frame_id=14), {}, "frame"),
+    (Probe(estimator_type=6), {}, "estimator_type"),
+    (Probe(is_clock_still=True), {}, "time"),
     (Probe(), {"EKF2_EV_CTRL": 0}, "switch"),
+    (Probe(), {"EKF2_SENS_EN": 8183}, "switch"),
+]
+
+Facing = Callable[[bytes], bytes | None]
+
+
+def losing(*names: str) -> Facing:
+    """The link loses messages of these names."""
+    numbers = {message_number(name) for name in names}
+    return lambda frame: None if message_id(frame) in numbers else frame
+
+
+def message_number(name: str) -> int:
+    return int(getattr(m, f"MAVLINK_MSG_ID_{name}"))
+
+
+def saying(name: str, **fields: int) -> Facing:
+    """The autopilot says something else in these fields."""
+    number, packer = message_number(name), m.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def alter(frame: bytes) -> bytes:
+        if message_id(frame) != number:
+            return frame
+        message = m.MAVLink(None).decode(bytearray(frame))
+        for key, value in fields.items():
+            setattr(message, key, value)
+        packer.seq = frame[4]
+        return bytes(message.pack(packer))
+
+    return alter
+
+
+# (what the autopilot says or what is lost on the way, the line that must be red, and no other)
+WRONG: list[tuple[Facing, str]] = [
+    (losing("TIMESYNC"), "time.sync"),
+    (losing("ATTITUDE_QUATERNION"), "stream.ATTITUDE_QUATERNION"),
+    (losing("LOCAL_POSITION_NED"), "stream.LOCAL_POSITION_NED"),
+    (saying("SYS_STATUS", onboard_control_sensors_health=0x320883F & ~1), "sensor.gyroscope"),
+    (saying("SYS_STATUS", onboard_control_sensors_health=0x320883F & ~2), "sensor.accelerometer"),
+    (saying("SYS_STATUS", onboard_control_sensors_health=0x320883F & ~8), "sensor.barometer"),
+    (saying("SYS_STATUS", battery_remaining=10), "sensor.battery"),
+    (saying("GPS_GLOBAL_ORIGIN", altitude=489_399), "origin"),
 ]
 
 
@@ -63,6 +115,74 @@ async def test_each_gate_broken_in_turn_is_named_alone() -> None:
                 for name, value in before.items():
                     await param.set_param_int(name, value)
     assert named == [[gate] for _, _, gate in BROKEN]
+
+
+async def test_what_the_autopilot_says_or_the_link_loses_turns_its_own_line_red_alone() -> None:
+    """Issue 4: time sync, stream rates, sensors, origin, each broken in turn against the emulation."""
+    red: list[list[str]] = []
+    with Standing() as vehicle:
+        async with open_vehicle(vehicle.ground_url) as link:
+            await gather(link, Surroundings(), probe=Probe(), seconds=0.8)  # the origin is set by this
+            for alter, _ in WRONG:
+                vehicle.alter = alter
+                await asyncio.sleep(0.3)
+                link.newest.clear()
+                await link.wait_for("HEARTBEAT", 3.0)
+                facts = await gather(link, Surroundings(), probe=Probe(), seconds=1.2)
+                red.append([c.name for c in all_checks(facts) if c.verdict is Verdict.FAIL])
+    assert red == [[line] for _, line in WRONG]
+
+
+async def test_without_a_status_of_the_estimator_fusion_is_red() -> None:
+    with Standing() as vehicle:
+        vehicle.alter = losing("ESTIMATOR_STATUS")
+        async with open_vehicle(vehicle.ground_url) as link:
+            facts = await gather(link, Surroundings(), probe=None, seconds=1.2)
+    red = [c.name for c in all_checks(facts) if c.verdict is Verdict.FAIL]
+    assert red == ["stream.ESTIMATOR_STATUS", "fusion"]
+
+
+async def test_each_parameter_that_matters_is_named_when_it_is_wrong() -> None:
+    """Issue 4: every parameter that matters compared with the manifest: expected, actual, why, how to mend."""
+    wrong = {
+        "EKF2_EV_CTRL": 0, "EKF2_SENS_EN": 8183, "EKF2_HGT_REF": 1, "EKF2_GPS_CTRL": 7, "SYS_HAS_GPS": 1,
+        "EKF2_MAG_TYPE": 0, "COM_ARM_WO_GPS": 0, "COM_OBL_RC_ACT": 3, "COM_OF_LOSS_T": 30.0, "NAV_RCL_ACT": 2,
+        "NAV_DLL_ACT": 2, "COM_LOW_BAT_ACT": 0, "RTL_RETURN_ALT": 60.0, "GF_MAX_HOR_DIST": 0.0, "GF_MAX_VER_DIST": 0.0,
+        "EKF2_EV_NOISE_MD": 1, "EKF2_EV_QMIN": 90, "EKF2_EV_DELAY": 200.0, "EKF2_NOAID_TOUT": 10_000_000,
+        "MAV_FWDEXTSP": 0,
+    }  # fmt: skip
+    assert set(wrong) == {expected.name for expected in PX4_MANIFEST.parameters}
+    with Standing(**wrong) as vehicle:
+        async with open_vehicle(vehicle.ground_url) as link:
+            facts = await gather(link, Surroundings(), probe=None, seconds=0.8)
+            changes = await apply_manifest(link)
+            mended = await gather(link, Surroundings(), probe=None, seconds=0.8)
+    lines = {c.name.removeprefix("parameter."): c for c in all_checks(facts) if c.name.startswith("parameter.")}
+    assert set(lines) == set(wrong)
+    must = {expected.name for expected in PX4_MANIFEST.parameters if expected.must}
+    assert {name for name, line in lines.items() if line.verdict is Verdict.FAIL} == must
+    assert all(line.verdict is not Verdict.OK and line.expected and line.why and line.mend for line in lines.values())
+    assert {change.name for change in changes if change.ok} == set(wrong)
+    assert not [c for c in all_checks(mended) if c.name.startswith("parameter.") and c.verdict is not Verdict.OK]
+
+
+async def test_what_this_computer_lacks_turns_its_own_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Issue 4: LiDAR packets arriving, clock, disk."""
+    gib, jumped = 1 << 30, iter([0.0])
+    real_time = time.time
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(100 * gib, 99 * gib, gib))
+    monkeypatch.setattr("stockpilot.doctor_facts.time.time", lambda: real_time() + next(jumped, 3600.0))
+    with Standing() as vehicle:
+        async with open_vehicle(vehicle.ground_url) as link:
+            around = Surroundings(lidar=f"udp://127.0.0.1:{free_port()}", folder=tmp_path)
+            facts = await gather(link, around, probe=None, seconds=0.8)
+    lines = {c.name: c for c in all_checks(facts)}
+    assert lines["lidar"].verdict is Verdict.FAIL
+    assert "no packets" in lines["lidar"].actual
+    assert lines["computer.disk"].verdict is Verdict.FAIL
+    assert lines["computer.clock"].verdict is Verdict.WARN
+    assert "stepped 3600000 ms" in lines["computer.clock"].actual
+    assert [name for name, line in lines.items() if line.verdict is Verdict.FAIL] == ["lidar", "computer.disk"]
 
 
 async def test_apply_sets_what_is_wrong_and_reads_it_back() -> None:

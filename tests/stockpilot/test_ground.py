@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import random
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ from typer.testing import CliRunner
 from stockpilot.ground import ground_app, read_status
 from stockpilot.vehicle_link import VehicleLink
 from tests.stockpilot.emulated import Standing, free_port
+from tests.stockpilot.log_keeper import LogKeeper
 
 
 def ground(*arguments: str) -> tuple[int, dict[str, Any]]:
@@ -37,10 +40,40 @@ def test_abort_answers_also_on_the_ground_and_may_be_repeated() -> None:
             assert (code, result["ok"], result["asked"]) == (0, True, name), result
 
 
-def test_logs_that_cannot_be_listed_are_told_not_raised() -> None:
+def test_a_hold_that_cannot_be_is_refused_with_the_reason() -> None:
+    """PX4.md 4: "AUTO_LOITER(Hold), MISSION, RTL need *global* position on rotary wing": without vision there is none."""
+    with Standing() as vehicle:
+        vehicle.autopilot.commander.is_armed = True  # as if it had lost its vision in the air
+        code, result = ground("hold", "--connect", vehicle.ground_url)
+    assert (code, result["ok"], result["asked"]) == (1, False, "hold")
+    assert "DENIED" in result["error"], result
+
+
+def test_a_vehicle_without_logs_has_an_empty_list() -> None:
     with Standing() as vehicle:
         code, result = ground("logs", "--connect", vehicle.ground_url)
-    assert code == (0 if result["ok"] else 1)
+    assert (code, result["ok"], result["logs"]) == (0, True, [])
+
+
+@pytest.mark.parametrize("lost_every", [0, 37])
+def test_the_newest_logs_are_downloaded_to_the_byte(tmp_path: Path, lost_every: int) -> None:
+    logs = {n: random.Random(n).randbytes(20_000 + n) for n in (1, 2, 3)}
+    with LogKeeper(logs, lost_every=lost_every) as vehicle:
+        code, result = ground("logs", "--connect", vehicle.ground_url, "--out", str(tmp_path / "logs"), "--newest", "2")
+        assert bool(vehicle.lost) is bool(lost_every)
+    assert (code, result["ok"]) == (0, True), result
+    assert [(log["id"], log["bytes"]) for log in result["logs"]] == [(n, len(logs[n])) for n in (1, 2, 3)]
+    files = sorted((tmp_path / "logs").iterdir())
+    assert [str(path) for path in files] == result["saved"]
+    assert [path.name.split("_")[0] for path in files] == ["log002", "log003"]
+    assert [path.read_bytes() for path in files] == [logs[2], logs[3]]
+
+
+def test_logs_that_nobody_lists_are_told_not_raised() -> None:
+    with LogKeeper({}) as vehicle:
+        code, result = ground("logs", "--connect", vehicle.ground_url)
+    assert code == 1
+    assert "list of logs was not given" in result["error"]
     assert result["logs"] == []
 
 

@@ -97,7 +97,9 @@ GATES = [
 def test_each_shut_gate_is_named_alone(
     autopilot: str, broken: dict[str, Any], sent: dict[str, Any] | None, gate: str
 ) -> None:
-    """Issue 4: fusion: is what we send really fused, and if not, which gate stops it."""
+    """Issue 4: fusion: is what we send really fused, and if not, which gate stops it. AUTOPILOTS.md: "starts only if
+    two samples are < 200 ms apart and the newest is < 200 ms old". PX4.md: "6 MOCAP -> vehicle_mocap_odometry, not
+    read by EKF2"."""
     facts = healthy(autopilot, is_vision_fused=False, estimator_flags=229)
     if "parameters" in broken:
         broken = {"parameters": {**facts.parameters, **broken["parameters"]}}
@@ -119,7 +121,8 @@ def test_a_gate_shut_in_part_is_red_though_flags_say_fused() -> None:
 
 @pytest.mark.parametrize(("part", "gate"), [("position", "frame"), ("velocity", "frame"), ("heading", "quaternion")])
 def test_a_part_that_px4_drops_is_told_without_knowing_what_was_sent(part: str, gate: str) -> None:
-    """Recorded in wrong_input: flags stay 511, the test ratio of the dropped part is not a number."""
+    """Recorded in wrong_input: flags stay 511, the test ratio of the dropped part is not a number. PX4.md: "Any other
+    frame_id: position dropped silently (attitude/velocity still used)"."""
     facts = healthy(vision=None)
     facts = replace(facts, ratios={name: ratio for name, ratio in facts.ratios.items() if name != part})
     checks = check_fusion(facts)

@@ -139,7 +139,8 @@ def test_an_unknown_message_is_stepped_over_and_counted() -> None:
 @pytest.mark.parametrize("name", TLOGS)
 @pytest.mark.parametrize("direction", ["from_fc", "to_fc"])
 def test_every_recorded_frame_is_decoded(name: str, direction: str) -> None:
-    """Issue 4: our MAVLink decoder reads every recorded frame."""
+    """Issue 4: our MAVLink decoder reads every recorded frame. PX4.md: "All of it can be heard in
+    data/autopilots/px4"."""
     records = read_tlog(shared_data("autopilots", f"{name}.{direction}.tlog"))
     decoder = Decoder()
     found = decoder.receive(b"".join(data for _, data in records))

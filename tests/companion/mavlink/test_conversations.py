@@ -88,6 +88,22 @@ def test_the_autopilot_is_told_by_its_heartbeat_and_no_restart_is_imagined(autop
     assert not heard.session.vehicle_state(START_NS + 10_000 * SECOND).is_connected
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "name", "armed_s"),
+    [("px4", "ev_offboard", 55.0), ("px4", "vision_loss", 0.0), ("ardupilot", "ev_guided", 0.0)],
+)
+def test_sensors_and_battery_of_real_ones_that_flew_do_not_stand_against_arming(
+    autopilot: str, name: str, armed_s: float
+) -> None:
+    """The doctor's checks, in front of arming: what really armed must pass those that look at the vehicle itself."""
+    heard = listen(autopilot, name)
+    armed = armed_s or heard.first("armed")
+    before = [state for t, state in heard.states if armed - 2.0 < t < armed]
+    assert before
+    reasons = {reason.split(":")[0] for state in before for reason in state.not_ready_because}
+    assert not {reason for reason in reasons if reason.startswith("sensor") or reason == "origin"}
+
+
 def test_px4_ev_offboard_goes_hold_offboard_land_and_back_to_offboard_disarmed() -> None:
     """PX4.md 7: after landing and disarming the heartbeat goes back to OFFBOARD."""
     heard = listen("px4", "ev_offboard")
@@ -121,6 +137,8 @@ def test_px4_position_between_origin_and_vision_is_told_invalid() -> None:
 
 
 def test_px4_setpoint_loss_is_heard_as_failsafe_land() -> None:
+    """AUTOPILOTS.md: "COM_OBL_RC_ACT (default 0 = Position; 4 = Land, 5 = Hold)". PX4.md: "Hold and Return need a
+    global position. Without one, loss of setpoints ends in AUTO_LAND, loss of vision in DESCEND"."""
     heard = listen("px4", "setpoint_loss")
     assert heard.first("autopilot_failsafe", "offboard to land") == pytest.approx(80.0, abs=0.1)
     assert heard.first("autopilot_event", "Failsafe activated") == pytest.approx(79.53, abs=0.1)
@@ -135,7 +153,8 @@ def test_px4_setpoint_loss_is_heard_as_failsafe_land() -> None:
 
 
 def test_px4_vision_loss_is_heard_within_a_report_and_ends_in_descend() -> None:
-    """PX4.md 6: 383 to 127 at once, 101 after 4.5 s, DESCEND which the heartbeat calls AUTO.LAND."""
+    """PX4.md 6: 383 to 127 at once, 101 after 4.5 s, DESCEND which the heartbeat calls AUTO.LAND. AUTOPILOTS.md: "dead
+    reckoning until EKF2_NOAID_TOUT 5 s, then local position invalid, then failsafe"."""
     heard = listen("px4", "vision_loss")
     assert heard.first("vision_not_fused") == pytest.approx(82.5, abs=0.1)
     assert heard.at(84.0).is_position_valid, "dead reckoning"
@@ -168,7 +187,7 @@ def test_px4_gives_no_text_to_a_companion_alone() -> None:
 
 
 def test_px4_timesync_questions_are_counted_to_500() -> None:
-    """PX4's 500th exchange came at 50.0 s."""
+    """PX4's 500th exchange came at 50.0 s. PX4.md: "uses the timesync offset only after 500 good exchanges"."""
     heard = listen("px4", "ev_offboard")
 
     def waits(t: float) -> bool:
@@ -210,7 +229,8 @@ def test_ardupilot_attitudes_come_stamped_in_our_clock_in_order() -> None:
 
 
 def test_ardupilot_vision_loss_is_silent_for_7_s_then_failsafe_land() -> None:
-    """ARDUPILOT.md: flags look healthy up to 7 s: the companion must watch the age of its own vision."""
+    """ARDUPILOT.md: flags look healthy up to 7 s: the companion must watch the age of its own vision. AUTOPILOTS.md:
+    "EKF failsafe after about 1 s over threshold: Land"."""
     heard = listen("ardupilot", "vision_loss")
     assert heard.first("vision_not_fused") == pytest.approx(43.57, abs=0.1)
     assert heard.at(43.0).is_position_valid

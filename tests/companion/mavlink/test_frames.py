@@ -27,6 +27,7 @@ def test_there_and_back_is_the_same_place(vector: tuple[float, float, float]) ->
 
 @given(angles, st.floats(-1.5, 1.5), angles)
 def test_a_point_seen_in_the_body_is_the_same_point_in_both_worlds(roll: float, pitch: float, yaw: float) -> None:
+    """PX4.md: "it must be body-FRD to NED/FRD always"."""
     q = quat_from_rpy(roll, pitch, yaw)
     point_flu = np.array([1.0, 2.0, 3.0])
     q_ned = np.array(frames.quaternion_to_ned_frd(q))
@@ -36,7 +37,8 @@ def test_a_point_seen_in_the_body_is_the_same_point_in_both_worlds(roll: float, 
 
 @given(angles, st.floats(-1.5, 1.5), angles, st.floats(0.999, 1.001))
 def test_quaternion_norm_in_float32_is_within_1e5(roll: float, pitch: float, yaw: float, scale: float) -> None:
-    """AUTOPILOTS.md: PX4 ignores a quaternion whose norm is off by more than 1e-5."""
+    """AUTOPILOTS.md: PX4 ignores a quaternion whose norm is off by more than 1e-5. PX4.md: "Quaternion must have
+    |norm-1| <= 1e-5, otherwise EKF2 drops the attitude"."""
     q = np.array(frames.quaternion_to_ned_frd(quat_from_rpy(roll, pitch, yaw) * scale), dtype=np.float32)
     assert abs(math.sqrt(float((q.astype(np.float64) ** 2).sum())) - 1.0) < 1e-6
 
@@ -62,7 +64,7 @@ def test_pose_covariance_changes_sign_where_one_axis_is_turned() -> None:
 
 
 def test_velocity_covariance_says_nan_for_turn_rates() -> None:
-    """AUTOPILOTS.md: unset values are NaN."""
+    """AUTOPILOTS.md: unset values are NaN. PX4.md: "Unset values = NaN"."""
     covariance = np.array([[1.0, 2, 3], [2, 4, 5], [3, 5, 6]])
     got = np.full((6, 6), np.nan)
     got[np.triu_indices(6)] = frames.velocity_covariance_to_frd(covariance)

@@ -40,7 +40,9 @@ def test_good_parameters_do_not_stand_against_arming(autopilot: int) -> None:
 
 @pytest.mark.parametrize(("autopilot", "name", "value"), NEVER_ARM)
 def test_a_wrong_parameter_refuses_arming_and_teaches(autopilot: int, name: str, value: float) -> None:
-    """Each line: expected, actual, why, how to mend."""
+    """Each line: expected, actual, why, how to mend. AUTOPILOTS.md: "EKF2_EV_CTRL (0 = vision off, the default: bits
+    hpos 1, vpos 2, vel 4, yaw 8), EKF2_HGT_REF, EKF2_GPS_CTRL 0, EKF2_EV_DELAY". PX4.md: "15 with ODOMETRY; 11 with
+    VISION_POSITION_ESTIMATE"."""
     peer = Peer(autopilot)
     peer.parameters[name] = value
     peer.run(6.0)

@@ -63,6 +63,8 @@ def test_before_the_sensors_start_the_heartbeat_is_sent() -> None:
 
 
 def test_when_everything_stands_still_no_component_beats() -> None:
+    """AUTOPILOTS.md: "A heartbeat that keeps coming from a hung program lies: gate it on the age of scan, estimate and
+    setpoint"."""
     signs = SignsOfLife(**ALIVE, quality=90)
     assert beats(signs, 106 * SECOND) == {}
 

@@ -63,6 +63,7 @@ def test_nothing_is_commanded_before_the_autopilot_is_known() -> None:
 def test_each_mode_is_asked_for_in_the_autopilots_own_numbers(
     autopilot: int, kind: RequestKind, params: tuple[int, ...]
 ) -> None:
+    """PX4.md: "Mode command DO_SET_MODE(base 1 custom, main 6)"."""
     peer = Peer(autopilot)
     peer.run(1.1)
     peer.request(kind)
@@ -116,7 +117,8 @@ def test_a_refused_stream_is_told_and_does_not_stop_the_others() -> None:
 
 @pytest.mark.parametrize("autopilot", [PX4_ID, ARDUPILOT])
 def test_no_odometry_leaves_before_the_origin_is_confirmed(autopilot: int) -> None:
-    """PX4.md 6: the origin before the first vision sample."""
+    """PX4.md 6: the origin before the first vision sample. AUTOPILOTS.md: "automatic modes need SET_GPS_GLOBAL_ORIGIN,
+    before the first vision sample, altitude 0"."""
     peer = Peer(autopilot)
     peer.answers_origin_after = 10**9
     peer.run(6.0, vision=True)
@@ -129,7 +131,8 @@ def test_no_odometry_leaves_before_the_origin_is_confirmed(autopilot: int) -> No
 
 
 def test_the_origins_altitude_is_zero() -> None:
-    """PX4.md 7: an origin at 489 m made local z jump to 489 m when vision began."""
+    """PX4.md 7: an origin at 489 m made local z jump to 489 m when vision began. AUTOPILOTS.md: "automatic modes need
+    SET_GPS_GLOBAL_ORIGIN, before the first vision sample, altitude 0"."""
     peer = Peer()
     peer.run(4.0)
     (sent,) = peer.of("SET_GPS_GLOBAL_ORIGIN")
@@ -171,6 +174,7 @@ def test_no_origin_is_set_while_px4_holds_a_horizontal_position() -> None:
 
 @pytest.mark.parametrize("autopilot", [PX4_ID, ARDUPILOT])
 def test_no_origin_is_set_on_an_armed_vehicle(autopilot: int) -> None:
+    """PX4.md: "sending SET_GPS_GLOBAL_ORIGIN makes the local position jump to about (5.2e6, 1.07e6) m"."""
     peer = Peer(autopilot)
     peer.armed = True
     peer.run(6.0)
@@ -178,6 +182,7 @@ def test_no_origin_is_set_on_an_armed_vehicle(autopilot: int) -> None:
 
 
 def test_an_origin_with_an_altitude_is_warned_of() -> None:
+    """PX4.md: "an origin at 489 m made local z jump to 489 m when vision began, still valid"."""
     peer = Peer()
     peer.run(0.9)
     peer.say(p.heartbeat())
@@ -190,6 +195,7 @@ def test_an_origin_with_an_altitude_is_warned_of() -> None:
 
 
 def test_timesync_is_answered_with_our_monotonic_clock() -> None:
+    """PX4.md: "so do not answer TIMESYNC with wall time there"."""
     peer = Peer()
     peer.say(m.MAVLink_timesync_message(0, 777))
     (answer,) = peer.take()
@@ -197,6 +203,7 @@ def test_timesync_is_answered_with_our_monotonic_clock() -> None:
 
 
 def test_timesync_is_asked_at_10_hz() -> None:
+    """AUTOPILOTS.md: "TIMESYNC at 10 Hz; used after 500 good exchanges (about 50 s) with round trip < 10 ms"."""
     peer = Peer()
     peer.run(5.0)
     asked = [message for message in peer.of("TIMESYNC") if message.tc1 == 0]
@@ -218,6 +225,7 @@ def test_px4_is_not_armed_before_its_500_exchanges() -> None:
 
 
 def test_ardupilot_needs_no_500_exchanges() -> None:
+    """AUTOPILOTS.md: "corrects jitter itself"."""
     peer = Peer(ARDUPILOT)
     peer.make_ready()
     assert state(peer).is_ready_to_arm, state(peer).not_ready_because
@@ -243,7 +251,8 @@ def test_odometry_is_stamped_in_our_clock() -> None:
 
 @pytest.mark.parametrize(("autopilot", "frame"), [(PX4_ID, 1), (ARDUPILOT, 20)])
 def test_odometry_is_what_each_autopilot_takes(autopilot: int, frame: int) -> None:
-    """AUTOPILOTS.md: frames, estimator type, quality, reset counter."""
+    """AUTOPILOTS.md: frames, estimator type, quality, reset counter. PX4.md: "no vehicle_global_position is ever
+    published even after SET_GPS_GLOBAL_ORIGIN"."""
     peer = Peer(autopilot)
     peer.run(3.0)
     sample = p.estimate(
@@ -268,7 +277,8 @@ def test_odometry_is_what_each_autopilot_takes(autopilot: int, frame: int) -> No
 
 @pytest.mark.parametrize("autopilot", [PX4_ID, ARDUPILOT])
 def test_samples_leave_no_closer_than_20_ms_and_never_backwards(autopilot: int) -> None:
-    """ARDUPILOT.md: messages closer than 20 ms are dropped."""
+    """ARDUPILOT.md: messages closer than 20 ms are dropped. AUTOPILOTS.md: ">= 4 Hz, used up to 50 Hz". PX4.md:
+    "too-fast samples are dropped with EV data too fast"."""
     peer = Peer(autopilot)
     peer.run(3.0)
     times = [0, 10, 19, 20, 15, 45, 45, 65]
@@ -278,7 +288,8 @@ def test_samples_leave_no_closer_than_20_ms_and_never_backwards(autopilot: int) 
 
 
 def test_a_failed_estimate_is_not_sent() -> None:
-    """PX4.md 7: quality -1 is accepted by PX4: so it must not leave. FAULTS 8: quality -1, silent."""
+    """PX4.md 7: quality -1 is accepted by PX4: so it must not leave. FAULTS 8: quality -1, silent. AUTOPILOTS.md: "-1
+    failed, 0 unknown, 1..100; must reach EKF2_EV_QMIN (0 = off)"."""
     peer = Peer()
     peer.run(3.0)
     assert not peer.session.send_odometry(p.estimate(peer.t_ns, quality=-1))
@@ -294,6 +305,7 @@ def test_a_failed_estimate_is_not_sent() -> None:
     ],
 )
 def test_a_sample_that_is_not_finite_never_leaves(changes: dict[str, object]) -> None:
+    """AUTOPILOTS.md: "NaN check"."""
     peer = Peer()
     peer.run(3.0)
     assert not peer.session.send_odometry(p.estimate(peer.t_ns, **changes))
@@ -304,7 +316,8 @@ def test_a_sample_that_is_not_finite_never_leaves(changes: dict[str, object]) ->
 
 @pytest.mark.parametrize("autopilot", [PX4_ID, ARDUPILOT])
 def test_a_setpoint_is_velocity_and_yaw_rate_in_local_ned(autopilot: int) -> None:
-    """PX4.md 4 and ARDUPILOT.md: other frames are refused, or make ArduPilot swing."""
+    """PX4.md 4 and ARDUPILOT.md: other frames are refused, or make ArduPilot swing. AUTOPILOTS.md:
+    "SET_POSITION_TARGET_LOCAL_NED, frame LOCAL_NED or BODY_NED, with type masks"."""
     peer = Peer(autopilot)
     peer.run(1.1)
     assert peer.session.send_setpoint(p.setpoint(peer.t_ns, (0.4, 0.2, 0.1), 0.3))
@@ -351,6 +364,35 @@ def test_arming_is_sent_once_the_gate_is_green_and_its_end_is_told() -> None:
     (command,) = [c for c in peer.of("COMMAND_LONG") if c.command == 400]
     assert (command.param1, command.param2) == (1.0, 0.0), "never by force"
     assert "arm_accepted" in peer.event_names()
+
+
+@pytest.mark.parametrize("autopilot", [PX4_ID, ARDUPILOT])
+@pytest.mark.parametrize(("turn_deg", "is_refused"), [(0, False), (8, False), (12, True), (90, True), (180, True)])
+def test_an_attitude_that_is_not_the_estimates_refuses_arming(
+    autopilot: int, turn_deg: float, is_refused: bool
+) -> None:
+    """FAULTS 27: frames mixed up (ENU/NED, yaw): attitude against FC within 10 deg, before arming. Fused, the
+    autopilot's heading is the vision's: one that differs is turned by a frame or a mount."""
+    peer = Peer(autopilot)
+    half = math.radians(turn_deg) / 2
+    peer.q = (math.cos(half), 0.0, 0.0, math.sin(half))
+    peer.make_ready()
+    reasons = state(peer).not_ready_because
+    assert [r for r in reasons if r.startswith(f"frames: estimate and autopilot disagree by {turn_deg} deg")] == [
+        *reasons
+    ]
+    assert bool(reasons) is is_refused
+    peer.request(RequestKind.ARM)
+    assert bool([c for c in peer.take() if c.get_type() == "COMMAND_LONG" and c.command == 400]) is not is_refused
+
+
+def test_a_roll_that_is_not_the_estimates_refuses_arming_too() -> None:
+    """FAULTS 27: a LiDAR mounted on its side agrees in heading."""
+    peer = Peer()
+    peer.q = (math.cos(0.15), math.sin(0.15), 0.0, 0.0)
+    peer.make_ready()
+    (reason,) = state(peer).not_ready_because
+    assert "disagree by 17 deg (0 in heading" in reason
 
 
 def test_a_refused_command_is_told_with_the_autopilots_word() -> None:
@@ -408,7 +450,8 @@ def ready_in_guided() -> Peer:
 
 
 def test_arducopter_takes_off_by_command_and_setpoints_wait_for_it() -> None:
-    """ARDUPILOT.md recordings: armed in GUIDED it leaves the ground by NAV_TAKEOFF, and says in air (2) when up."""
+    """ARDUPILOT.md recordings: armed in GUIDED it leaves the ground by NAV_TAKEOFF, and says in air (2) when up.
+    AUTOPILOTS.md: "GUIDED, armed, EKF origin"."""
     peer = ready_in_guided()
     assert peer.session.send_setpoint(p.setpoint(peer.t_ns)), "standing still needs no take-off"
     assert not peer.session.send_setpoint(p.setpoint(peer.t_ns, (0, 0, 0.5)))

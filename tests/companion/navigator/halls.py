@@ -150,6 +150,7 @@ class Rig:
         self.armed, self.mode, self.landed = False, FlightMode.HOLD, LandedState.ON_GROUND
         self.heartbeat = True
         self.see = True
+        self.hears_setpoints = True
         self.battery: float | None = 1.0
         self.navigator, self.guard = Navigator(config), Guard(config)
         self.walls: WallRanges | None = None
@@ -219,7 +220,10 @@ class Rig:
             self.heartbeat_ns = self.t
         vehicle = self.vehicle()
         self.output = self.navigator.step(
-            self.t, NavigatorInput(estimate=self.estimate, walls=self.walls, vehicle=vehicle, commands=commands)
+            self.t,
+            NavigatorInput(
+                estimate=self.estimate, walls=self.walls, vehicle=vehicle, commands=commands, sent=self.setpoint
+            ),
         )
         verdict = self.guard.check(
             self.output.setpoint, self.t,
@@ -247,7 +251,7 @@ class Rig:
         wanted, yaw_rate = np.zeros(3), 0.0
         if self.armed and self.mode is FlightMode.LAND:
             wanted = np.array([0.0, 0.0, -0.7])
-        elif self.armed and self.mode is FlightMode.OFFBOARD and self.setpoint is not None:
+        elif self.armed and self.mode is FlightMode.OFFBOARD and self.setpoint is not None and self.hears_setpoints:
             v, yaw0 = self.setpoint.velocity_map_mps, self.start[2]  # silent: zeros
             c, s = math.cos(yaw0), math.sin(yaw0)
             wanted = np.array([c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]])

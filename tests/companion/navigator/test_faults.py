@@ -114,6 +114,34 @@ def test_a_slow_lidar_slows_the_flight_within_a_second_or_so(flown_to):
     assert rig.navigator.state is S.FOLLOW
 
 
+# ---- 13: the vehicle no longer does what it is told -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("state", [S.FIND_WALL, S.FOLLOW, S.RETURN])
+def test_a_vehicle_that_does_not_follow_its_setpoints_is_landed_within_some_seconds(flown_to, state):
+    """ArduCopter that no longer gets them stops after 3 s, holds in GUIDED and says nothing (ARDUPILOT.md, GUIDED).
+    AUTOPILOTS.md: "GUID_TIMEOUT 3 s: zero velocity"."""
+    rig = flown_to(state)
+    rig.hears_setpoints = False
+    begin = rig.t
+    run(rig, 8.0)
+    lands = [r for r in rig.requests if r.kind is RequestKind.LAND]
+    assert lands, rig.log.events[-5:]
+    assert 2.0 < (lands[0].t_ns - begin) / 1e9 < 6.0
+    assert "not_followed" in rig.log.events
+    end = rig.fly(60)
+    assert (end.state, end.outcome) == (S.DONE, "not_followed")
+    assert "does not follow its setpoints" in end.reason
+
+
+@pytest.mark.parametrize("state", [S.HOLDING, S.CLIMB])
+def test_where_no_motion_is_asked_for_nothing_is_missed(flown_to, state):
+    rig = flown_to(state)
+    rig.hears_setpoints = False
+    run(rig, 5.0)
+    assert "not_followed" not in rig.log.events
+
+
 # ---- 8, 9: registration fails, geometry is degenerate -----------------------------------------------------------------
 
 
@@ -197,6 +225,7 @@ def test_it_does_not_arm_before_all_is_ready_and_says_why(why):
 
 
 def test_it_gives_up_when_the_vehicle_will_not_arm(flown_to):
+    """PX4.md: "arming is then refused (TEMPORARILY_REJECTED) while the signal is missing"."""
     rig = flown_to(S.ARMING)
     rig._obey = lambda request: setattr(rig, "mode", FlightMode.OFFBOARD)
     end = rig.fly(120)
@@ -206,6 +235,7 @@ def test_it_gives_up_when_the_vehicle_will_not_arm(flown_to):
 
 
 def test_it_streams_before_it_asks(flown_to):
+    """AUTOPILOTS.md: "a setpoint stream >= 2 Hz already running; valid local position (or velocity)"."""
     rig = flown_to(S.ARMING)
     trace = run(rig, 1.5)
     assert all(s is not None and s.kind is SetpointKind.VELOCITY for t, s in trace if t < 0.9)
@@ -241,7 +271,8 @@ def test_a_lost_link_is_held_then_left_silent(flown_to, state):
 
 @pytest.mark.parametrize("state", [s for s in IN_THE_AIR if s is not S.LAND])
 def test_vision_that_the_flight_controller_no_longer_fuses_holds_then_lands(flown_to, state):
-    """It dead-reckons then: real PX4 for 4.6 s, and what we see is of no use to it (docs/safety.md)."""
+    """It dead-reckons then: real PX4 for 4.6 s, and what we see is of no use to it (docs/safety.md). AUTOPILOTS.md:
+    "dead reckoning until EKF2_NOAID_TOUT 5 s, then local position invalid, then failsafe"."""
     rig = flown_to(state)
     said = rig.vehicle
     rig.vehicle = lambda: dataclasses.replace(said(), is_vision_fused=False)
@@ -308,6 +339,7 @@ def test_an_empty_battery_lands_here(flown_to, state):
 
 @pytest.mark.parametrize("ratio", [None, math.nan, -1.0])
 def test_a_battery_that_is_not_measured_ends_no_flight(flown_to, ratio):
+    """PX4.md: "simulated battery; 0 = no battery simulator"."""
     rig = flown_to(S.FOLLOW)
     rig.battery = ratio
     run(rig, 2.0)
@@ -408,6 +440,7 @@ def test_abort_does_not_take_it_from_the_pilot(flown_to):
 
 @pytest.mark.parametrize("mode", [FlightMode.LAND, FlightMode.DESCEND])
 def test_a_failsafe_landing_is_left_alone(flown_to, mode):
+    """PX4.md: "with no local and no global position that is DESCEND"."""
     rig = flown_to(S.FOLLOW)
     rig.mode = mode
     trace = run(rig, 2.0)

@@ -51,6 +51,7 @@ def test_numbers_that_are_none_become_zero_velocity(v):
 @quick
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 360.0), st.floats(0.0, 2.0), st.floats(-math.pi, math.pi))
 def test_never_moves_toward_anything_nearer_than_it_can_stop(seed, bearing, speed, yaw):
+    """AUTOPILOTS.md: "in offboard, stopping before an obstacle is ours"."""
     rng = np.random.default_rng(seed)
     ranges = rng.uniform(0.3, 6.0, 360)
     rig = GuardRig(ranges=ranges)
@@ -160,6 +161,7 @@ def test_equal_scans_on_the_ground_are_no_fault():
     ("age_ms", "kind", "moves"), [(250, "velocity", True), (350, "velocity", False), (550, "silent", False)]
 )
 def test_an_old_wish_is_never_flown_on(age_ms, kind, moves):
+    """AUTOPILOTS.md: "after 5 s a text, no action"."""
     rig = GuardRig()
     old = setpoint(rig.t, 0.5, 0.0, 0.0)
     rig.t += age_ms * MS

@@ -94,6 +94,7 @@ def test_nothing_is_painted_into_the_map_while_the_position_is_lost(there_and_ba
 
 
 def test_the_end_seen_again_brings_the_pose_back_and_a_jump_is_told(there_and_back: Corridor) -> None:
+    """AUTOPILOTS.md: "reset_counter moves only when the pose truly jumps"."""
     resets = [r.estimate.reset_counter for r in there_and_back.results]
     x = np.array([r.estimate.position_map_m[0] for r in there_and_back.results])
     jumps = np.flatnonzero(np.abs(np.diff(x)) > 0.4)

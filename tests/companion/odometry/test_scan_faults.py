@@ -111,7 +111,8 @@ def test_a_second_of_silence_is_bridged(cruise, flown: Flown) -> None:
 
 
 def test_a_carried_off_vehicle_is_found_again_and_the_reset_is_counted(flown: Flown) -> None:
-    """Three seconds vanish, clock and all: the vehicle is 1.5 m from where it is expected, along a wall that still fits."""
+    """Three seconds vanish, clock and all: the vehicle is 1.5 m from where it is expected, along a wall that still
+    fits. AUTOPILOTS.md: "a change resets the EKF to the measurement"."""
     gap_ns, cut_ns = 3_000_000_000, 45_000_000_000
     odometry = Odometry(CONFIG)
     feed(odometry, [m for m in flown.messages if m.t_ns <= cut_ns])

@@ -223,6 +223,7 @@ def test_nearly_full_disk_sheds_raw_packets_only_and_says_so_once(tmp_path: Path
 
 
 def test_first_write_error_latches_and_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """AUTOPILOTS.md: "latch the first error"."""
     recorder = a_recorder(tmp_path)
     fill(recorder, seconds=2)
     real_write = os.write

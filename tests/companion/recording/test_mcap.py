@@ -71,6 +71,7 @@ def test_whole_recording_is_whole() -> None:
 
 
 def test_recording_cut_at_every_byte_gives_what_came_before_and_is_told() -> None:
+    """AUTOPILOTS.md: "the indexed reader fails on a cut file, the stream reader does not"."""
     whole = small_recording(messages=100, chunk_bytes=800)
     expected, _ = messages_of(whole)
     whole_from = 0

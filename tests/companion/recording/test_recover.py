@@ -108,6 +108,7 @@ while True:
 
 
 def test_kill_at_a_random_time_loses_at_most_a_second(tmp_path: Path) -> None:
+    """AUTOPILOTS.md: "with 1 MiB chunks 7 % of the messages were lost at SIGKILL, with 64 KiB 0.3 %"."""
     rng = random.Random(os.getpid())
     writers = []
     for n in range(3):

@@ -84,6 +84,7 @@ async def _until(condition: object, timeout_s: float = 15.0) -> None:
 
 @pytest.mark.timeout(90)
 async def test_mavsdk_reads_arms_takes_off_flies_offboard_and_lands() -> None:
+    """AUTOPILOTS.md: "is the independent client that simbridge is tested with"."""
     async with connected() as (rig, system):
         action, param = ActionAsync(system), ParamAsync(system)
         telemetry, offboard = TelemetryAsync(system), OffboardAsync(system)

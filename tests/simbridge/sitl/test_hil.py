@@ -52,6 +52,7 @@ def test_a_sensor_frame_has_the_bytes_that_the_recorded_simulator_sent() -> None
 
 
 def test_masks_follow_the_recorded_pattern_baro_in_every_fifth_frame() -> None:
+    """PX4.md: "accel 0x7, gyro 0x38, mag 0x1C0, baro 0x1A00"."""
     recorded = [m.fields_updated for _, m in recorded_sensors(100)]
     link, ours = HilLink(), []
     for i in range(100):
@@ -63,6 +64,7 @@ def test_masks_follow_the_recorded_pattern_baro_in_every_fifth_frame() -> None:
 
 
 def test_without_magnetometer_its_bits_are_off() -> None:
+    """PX4.md: "accel 0x7, gyro 0x38, mag 0x1C0, baro 0x1A00"."""
     (message,) = sent(HilLink().hil_sensor(STEP_NS, REST, BARO))
     assert message.fields_updated == 0x1A3F
 
@@ -88,6 +90,7 @@ def test_rates_are_250_hz_sensors_20_hz_rangefinder_1_hz_heartbeat() -> None:
 
 
 def test_rangefinder_looks_down_and_speaks_centimetres() -> None:
+    """PX4.md: "HIL_OPTICAL_FLOW, DISTANCE_SENSOR"."""
     message = next(
         m for m in sent(HilLink().sensor_frames(STEP_NS, REST, None, 1.237)) if m.get_type() == "DISTANCE_SENSOR"
     )
@@ -103,6 +106,7 @@ def test_no_return_of_the_rangefinder_is_an_invalid_signal() -> None:
 
 
 def test_recorded_answers_are_one_for_each_sensor_frame_in_its_own_time() -> None:
+    """PX4.md: "PX4 answers each HIL_SENSOR with exactly one HIL_ACTUATOR_CONTROLS"."""
     link, controls = HilLink(), []
     for frame in recorded_answers():
         controls += link.receive(frame)
@@ -128,6 +132,7 @@ def test_recorded_motors_are_off_until_armed_and_rise_together() -> None:
 
 
 def test_the_request_for_ground_truth_is_noted_and_not_answered() -> None:
+    """PX4.md: "SET_MESSAGE_INTERVAL(115 HIL_STATE_QUATERNION, 5000 us) and one HEARTBEAT"."""
     link = HilLink()
     link.receive(recorded_answers()[0])
     assert link.truth_period_ns == 5_000_000

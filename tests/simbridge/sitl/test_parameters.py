@@ -46,11 +46,13 @@ def test_the_thrust_law_told_to_px4_is_the_vehicles() -> None:
 
 
 def test_rotors_are_front_right_rear_left_front_left_rear_right() -> None:
+    """PX4.md: "none_iris motor geometry"."""
     places = [(parameters.PX4[f"CA_ROTOR{i}_PX"], parameters.PX4[f"CA_ROTOR{i}_PY"]) for i in range(4)]
     assert places == [(0.2, 0.2), (-0.2, -0.2), (0.2, -0.2), (-0.2, 0.2)]
 
 
 def test_px4_never_climbs_home_under_a_roof() -> None:
-    """Return (2 of NAV_RCL_ACT, 3 of COM_OBL_RC_ACT) climbs to 60 m."""
+    """Return (2 of NAV_RCL_ACT, 3 of COM_OBL_RC_ACT) climbs to 60 m. AUTOPILOTS.md: "a fallback can choose it once an
+    origin is set: a climb under a roof"."""
     assert parameters.PX4["COM_OBL_RC_ACT"] == 4
     assert parameters.PX4["NAV_RCL_ACT"] == 3

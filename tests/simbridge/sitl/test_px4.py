@@ -61,6 +61,7 @@ def step(sitl: Px4Sitl, i: int) -> np.ndarray:
 
 
 def test_steps_do_not_wait_while_px4_boots_then_go_in_lockstep(sitl: Px4Sitl) -> None:
+    """PX4.md: "During boot, keep sending HIL_SENSOR without waiting"."""
     peer = RecordedPx4(sitl.port)
     peer.start()
     lockstep = []
@@ -72,6 +73,7 @@ def test_steps_do_not_wait_while_px4_boots_then_go_in_lockstep(sitl: Px4Sitl) ->
 
 
 def test_each_step_returns_the_answer_to_its_own_sensors(sitl: Px4Sitl) -> None:
+    """PX4.md: "PX4 answers each HIL_SENSOR with exactly one HIL_ACTUATOR_CONTROLS"."""
     RecordedPx4(sitl.port).start()
     answers = {
         decode(f).time_usec: decode(f).controls[:4]
@@ -97,6 +99,7 @@ def test_px4_hears_what_the_recorded_px4_heard(sitl: Px4Sitl) -> None:
 
 
 def test_a_px4_that_falls_silent_is_told_with_its_time(sitl: Px4Sitl) -> None:
+    """PX4.md: "If HIL_SENSOR stops, PX4 freezes"."""
     RecordedPx4(sitl.port, silent_after_us=1_200_000).start()
     for i in range(50):  # up to 1.2 s
         step(sitl, i)
@@ -105,6 +108,7 @@ def test_a_px4_that_falls_silent_is_told_with_its_time(sitl: Px4Sitl) -> None:
 
 
 def test_px4_gone_means_motors_off_and_back_means_lockstep_again(sitl: Px4Sitl) -> None:
+    """PX4.md: "PX4 is the TCP client (4560 + instance) and tries until a simulator accepts"."""
     RecordedPx4(sitl.port, leaves_after_us=13_000_000).start()  # armed, motors turning
     i = 0
     while i < 3100 and sitl.connections < 2 and (i < 200 or sitl.is_lockstep):
@@ -124,6 +128,7 @@ def test_px4_gone_means_motors_off_and_back_means_lockstep_again(sitl: Px4Sitl) 
 
 
 def test_no_px4_is_told_with_what_to_do() -> None:
+    """PX4.md: "PX4 is the TCP client (4560 + instance) and tries until a simulator accepts"."""
     backend = Px4Sitl(port=0, connect_timeout_s=0.1)
     with pytest.raises(SitlError, match=r"did not connect to TCP port .* --autopilot-binary"):
         step(backend, 0)
