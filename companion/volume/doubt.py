@@ -24,6 +24,8 @@ FLOOR_BENT_M = 0.04  # undulation; power-floated and dozed floors keep within 0.
 FLOOR_SEEN = 0.03  # of the area within the walls
 UNSEEN = 0.05  # of the floor
 UNSEEN_IN_PILE = 0.01
+PIT_DEPTH_M = 0.5  # floors do not sink so far
+PIT_M2 = 4.0
 THIN_CELLS = 4.0  # returns in the median cell
 
 
@@ -78,6 +80,14 @@ def doubt(
             f"only {100 * floor_share:.1f} % of the area within the walls shows bare floor: it may not be the floor"
         )
         extra.append(0.05 * pile_area)
+    pit = (e.height_m < -PIT_DEPTH_M) & (e.surface.state == CellState.SEEN)
+    pit_m2 = float(area[pit].sum())
+    if pit_m2 > PIT_M2:
+        said.append(
+            f"{pit_m2:.0f} m2 lie up to {-float(e.height_m[pit].min()):.1f} m below the floor that was found: "
+            "it may not be the floor, or z is not up"
+        )
+        extra.append(float((-e.height_m * area)[pit].sum()))
     if floor.undulation_m > FLOOR_BENT_M:
         said.append(f"the floor departs from a plane by {floor.undulation_m:.2f} m (1 sigma) over a few metres")
     if unseen > UNSEEN:

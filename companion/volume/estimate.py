@@ -9,16 +9,19 @@ from scipy import ndimage
 
 from companion.config import VolumeConfig
 from companion.messages import Array, PointMap, VolumeReport
+from companion.volume.contact import Contact, fit_contact
 from companion.volume.doubt import doubt
 from companion.volume.floor import Floor, fit_floor, level_floor
-from companion.volume.grid import Grid, Mask, cells_of, disc, grid_around
+from companion.volume.grid import Grid, Index, Mask, cells_of, disc, grid_around
 from companion.volume.interval import Evidence, error_budget, interval
 from companion.volume.objects import find_objects
-from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells
+from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells, without_strays
 from companion.volume.walls import Footprint, find_footprint
 
 MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
+
+BESIDE_WALLS_M = 1.0  # beyond the strip
 
 
 def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float | None = None) -> VolumeReport:
@@ -46,6 +49,8 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
     low = points[:, 2] < footprint.ceiling_m
     wanted = (key >= 0) & low & ~strip.ravel()[np.maximum(key, 0)]
     cells = robust_cells(points, np.where(wanted, key, -1), grid)
+    if footprint.has_walls:
+        cells = without_strays(cells, grid, footprint.depth_m < footprint.margin_m + BESIDE_WALLS_M)
     usable = cells.seen & (footprint.share > 0)
     if usable.sum() < 20:
         return _nothing(cfg, "the map shows no surface within the walls")
@@ -56,7 +61,21 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
     surface = build_surface(
         grid, cells, footprint.share > 0, strip, reach_m=INTERPOLATION_REACH_M, strip_width_m=footprint.margin_m
     )
-    return _report(point_map, cfg, grid, footprint, cells, floor, surface)
+    surface, contact = _meet_walls(points, grid, np.where(low, key, -1), footprint, floor, surface)
+    return _report(point_map, cfg, grid, footprint, cells, floor, surface, contact)
+
+
+def _meet_walls(
+    points: Array, grid: Grid, key: Index, footprint: Footprint, floor: Floor, surface: Surface
+) -> tuple[Surface, Contact]:
+    """The surface brought to where the walls' returns say that it meets them."""
+    strip = (np.abs(footprint.depth_m) < footprint.margin_m + 0.5 * grid.cell_m) & (footprint.share > 0)
+    x, y = grid.centres()
+    contact = fit_contact(
+        grid, points, key, footprint.polygon_m, surface.carried_m, surface.carried_m - floor.z(x, y), strip,
+        width_m=footprint.margin_m + grid.cell_m, noise_m=footprint.noise_m,
+    )  # fmt: skip
+    return replace(surface, z_m=surface.z_m + contact.rise_m), contact
 
 
 def _report(
@@ -67,6 +86,7 @@ def _report(
     cells: Cells,
     floor: Floor,
     surface: Surface,
+    contact: Contact,
 ) -> VolumeReport:
     x, y = grid.centres()
     floor_z = np.where(footprint.share > 0, floor.z(x, y), np.nan)
@@ -87,6 +107,7 @@ def _report(
         grid=grid,
         cells=cells,
         surface=surface,
+        contact=contact,
         floor=floor,
         height_m=height,
         share=footprint.share,
