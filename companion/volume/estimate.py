@@ -21,6 +21,7 @@ from companion.volume.walls import Footprint, find_footprint
 MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
 
+LEAST_KEYFRAMES = 6  # that see the floor, before their disagreement on it is judged
 BESIDE_WALLS_M = 1.0  # beyond the strip
 
 
@@ -103,6 +104,8 @@ def _report(
     area = grid.cell_area_m2 * footprint.share
     volume = float(np.sum((height * area)[pile]))
     position_sigma = max(point_map.position_sigma_m, footprint.pose_sigma_m)
+    # A rise of the whole map changes no volume: where the keyframes' own disagreement is seen, it is what counts.
+    disagreement = keyframe_height_sigma(point_map, cells, floor)
     evidence = Evidence(
         grid=grid,
         cells=cells,
@@ -115,7 +118,8 @@ def _report(
         depth_m=footprint.depth_m,
         has_walls=footprint.has_walls,
         position_sigma_m=position_sigma,
-        height_sigma_m=max(point_map.height_sigma_m, keyframe_height_sigma(point_map, cells, floor)),
+        height_sigma_m=point_map.height_sigma_m if disagreement is None else disagreement,
+        floor_disagreement_m=disagreement or 0.0,
         wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, 0.005)) if footprint.has_walls else 0.0,
     )
     total = float(area.sum())
@@ -163,23 +167,25 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
     return np.asarray(ndimage.binary_dilation(core, disc(cells_of(1.0, grid))) & inside)
 
 
-def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> float:
-    """How far the keyframes disagree on the floor's height, 1 sigma, less what noise explains."""
+def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> float | None:
+    """How far the keyframes disagree on the floor's height, 1 sigma, but for what noise may hide; None: too few see it."""
     on_floor = cells.of_point >= 0
     on_floor[on_floor] = floor.cells.ravel()[cells.of_point[on_floor]]
     index = np.flatnonzero(on_floor)
     if len(index) < 100:
-        return 0.0
+        return None
     points = point_map.points_map[index]
     r = points[:, 2] - floor.z(points[:, 0], points[:, 1])
     _, of_keyframe = np.unique(point_map.keyframe_id[index], return_inverse=True)
     n = np.bincount(of_keyframe)
     seen = n >= 20
-    if seen.sum() < 3:
-        return 0.0
+    if seen.sum() < LEAST_KEYFRAMES:
+        return None
     means = np.bincount(of_keyframe, r)[seen] / n[seen]
     spread = (1.4826 * float(np.median(np.abs(means - np.median(means))))) ** 2
-    return float(np.sqrt(max(spread - float(np.mean(np.var(r) / n[seen])), 0.0)))
+    # No less than what noise could hide.
+    explained = float(np.mean(np.var(r) / n[seen]))
+    return float(np.sqrt(max(spread - explained, explained)))
 
 
 def _only(point_map: PointMap, keep: Mask) -> PointMap:

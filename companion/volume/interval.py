@@ -39,6 +39,7 @@ class Evidence:
     has_walls: bool
     position_sigma_m: float
     height_sigma_m: float
+    floor_disagreement_m: float
     wall_sigma_m: float
 
 

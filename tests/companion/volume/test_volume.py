@@ -171,6 +171,28 @@ def test_z_that_points_down_is_told() -> None:
     assert not any("below the floor" in w for w in estimate_volume(cloud(heap_in_the_open(1.0)), CFG).warnings)
 
 
+def test_heap_that_the_map_cuts_is_told_and_widens_the_interval() -> None:
+    points = heap_in_the_open(1.0)
+    report = estimate_volume(cloud(points[points[:, 0] > 0]), CFG)
+    assert any("goes on beyond" in w for w in report.warnings)
+    assert report.interval_m3[1] > 186.2
+    assert not any("goes on beyond" in w for w in estimate_volume(cloud(points), CFG).warnings)
+
+
+def test_attitude_that_is_off_is_told_and_widens_the_interval() -> None:
+    synthetic = make_map(
+        HALLS["free-standing"], dataclasses.replace(QUICK, tilt_sigma_rad=0.004, height_sigma_m=0.035), 3
+    )
+    report, _ = measured(synthetic)
+    assert any("disagree on the floor" in w for w in report.warnings)
+    assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
+
+
+def test_rise_of_the_whole_map_widens_no_interval(free_standing: Synthetic) -> None:
+    told = dataclasses.replace(free_standing.point_map, height_sigma_m=0.5)
+    assert estimate_volume(told, CFG).interval_m3 == estimate_volume(free_standing.point_map, CFG).interval_m3
+
+
 def test_toe_of_a_heap_is_no_floor() -> None:
     points = heap_in_the_open(1.0)
     report = estimate_volume(cloud(points[points[:, 2] > 0.8]), CFG)
