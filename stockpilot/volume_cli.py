@@ -20,7 +20,8 @@ from companion.volume import estimate_volume
 
 MIN_CELL_M, MAX_CELL_M = 0.05, 5.0
 RETURNS_A_CELL = 12.0  # a cell is chosen so large that it usually holds so many
-LARGEST_STORE_M = 3000.0  # a larger extent, with as large heights, is in millimetres
+TALLEST_STORE_M = 150.0  # heights over a larger span are not in metres
+COARSE_M = 0.02  # coordinates that come in larger steps are told
 
 
 def volume_command(
@@ -157,8 +158,11 @@ def _checked(cloud: Path, point_map: PointMap) -> PointMap:
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     span = high - low
     told = " x ".join(f"{s:,.3g}" for s in span)
-    if max(span[:2]) > LARGEST_STORE_M and span[2] > 300.0:
-        raise FileFormatError(f"{cloud}: {told} is no store in metres, it looks like millimetres: give --scale 0.001")
+    if span[2] > TALLEST_STORE_M:
+        raise FileFormatError(
+            f"{cloud}: {told} is no store in metres: for millimetres give --scale 0.001, for centimetres --scale 0.01, "
+            "for feet --scale 0.3048; or is z not up in it?"
+        )
     if max(span[:2]) < 0.5:
         raise FileFormatError(
             f"{cloud}: {told} m is too small for a store: if the cloud is in kilometres give --scale 1000"
@@ -175,10 +179,25 @@ def _checked(cloud: Path, point_map: PointMap) -> PointMap:
     )
 
 
+def _coarse_step_m(point_map: PointMap) -> float:
+    """Step between neighbouring coordinates of a cloud that was stored in single precision far from its origin, else 0."""
+    plan = point_map.points_map[:, :2]
+    single = plan.astype(np.float32)
+    step = float(np.spacing(np.abs(single).max()))
+    return step if step > COARSE_M and np.array_equal(single, plan) else 0.0
+
+
 def _report(
     cloud: Path, volume: VolumeReport, point_map: PointMap, cell_m: float, density_t_m3: float | None
 ) -> dict[str, Any]:
     known = math.isfinite(volume.volume_m3)
+    warnings = list(volume.warnings)
+    step_m = _coarse_step_m(point_map)
+    if step_m:
+        warnings.append(
+            f"the cloud's coordinates come in steps of {step_m:g} m: it was stored in single precision far from its "
+            "origin; export it in double precision, or nearer to its origin"
+        )
     report: dict[str, Any] = {
         "cloud": cloud.name,
         "points": len(point_map.points_map),
@@ -192,7 +211,7 @@ def _report(
         "floor_area_m2": volume.floor_area_m2,
         "pile_area_m2": volume.pile_area_m2,
         "error_budget_m3": dict(volume.error_budget_m3),
-        "warnings": list(volume.warnings),
+        "warnings": warnings,
     }
     if density_t_m3 is not None and known:
         report["bulk_density_t_m3"] = density_t_m3

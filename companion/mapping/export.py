@@ -164,9 +164,12 @@ def _load_text(path: Path) -> PointMap:
     sample = lines[skip]
     delimiter = next((d for d in (",", ";") if d in sample), None)
     try:
-        points = np.loadtxt(path, delimiter=delimiter, skiprows=skip, usecols=(0, 1, 2), ndmin=2, comments="#")
+        points = np.loadtxt(
+            path, delimiter=delimiter, skiprows=skip, usecols=(0, 1, 2), ndmin=2, comments="#", encoding="latin-1"
+        )
     except ValueError as error:
-        raise FileFormatError(f"{path}: expected three numbers in each line: {error}") from error
+        commas = "; decimal commas are not read, write points" if delimiter == "," and ";" in sample else ""
+        raise FileFormatError(f"{path}: expected three numbers in each line: {error}{commas}") from error
     count = len(points)
     return PointMap(
         points_map=points.astype(np.float64),

@@ -84,11 +84,11 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[tuple[str, int, list[
                 case ["comment" | "obj_info", *text]:
                     comments.append(" ".join(text))
                 case ["element", name, count]:
-                    layout.append((name, int(count), []))
+                    layout.append((name, _count(count), []))
                 case ["property", "list", _, _, name]:
-                    layout[-1][2].append((name, "list"))
+                    _add_property(layout[-1][2], name, "list")
                 case ["property", kind, name]:
-                    layout[-1][2].append((name, TYPES[kind]))
+                    _add_property(layout[-1][2], name, TYPES[kind])
                 case _:
                     raise FileFormatError(f"{path}, line {number}: not a line of a PLY header: {raw[:60]!r}")
         except (KeyError, ValueError, IndexError) as error:
@@ -96,15 +96,29 @@ def _header(file: BinaryIO, path: Path) -> tuple[str, list[tuple[str, int, list[
     raise FileFormatError(f"{path}: no end_header in the first {MAX_HEADER_LINES} lines")
 
 
+def _count(text: str) -> int:
+    count = int(text)
+    if count < 0:
+        raise ValueError(f"there cannot be {count} rows")
+    return count
+
+
+def _add_property(kinds: list[tuple[str, str]], name: str, kind: str) -> None:
+    if any(name == other for other, _ in kinds):
+        raise ValueError(f"there is a property '{name}' already")
+    kinds.append((name, kind))
+
+
 def _binary(file: BinaryIO, path: Path, name: str, count: int, kinds: list[tuple[str, str]], order: str) -> Columns:
     dtype = np.dtype([(c, order + kind) for c, kind in kinds])
-    data = file.read(dtype.itemsize * count)
-    if len(data) < dtype.itemsize * count:
+    # Looked at before anything is read: a wrong count may ask for more memory than there is.
+    left = path.stat().st_size - file.tell()
+    if left < dtype.itemsize * count:
         raise FileFormatError(
             f"{path}: cut short: element '{name}' should hold {count} rows of {dtype.itemsize} bytes, "
-            f"found {len(data) // max(dtype.itemsize, 1)}"
+            f"found {left // max(dtype.itemsize, 1)}"
         )
-    rows = np.frombuffer(data, dtype=dtype)
+    rows = np.frombuffer(file.read(dtype.itemsize * count), dtype=dtype)
     return {c: rows[c] for c, _ in kinds}
 
 

@@ -10,6 +10,8 @@ from companion.messages import Array
 from companion.volume.grid import Index
 from companion.volume.polygon import signed_area, simplify_closed
 
+BULGE_M = 4.0  # walls bulge over about so many metres
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EdgeFit:
@@ -101,7 +103,10 @@ def _fit_edge(a: Array, b: Array, points: Array, spread: float) -> EdgeFit | Non
 
 
 def _waviness(s: Array, r: Array, length: float) -> float:
-    """1 sigma of the wall's own place along the stretch: means over about 1 m, less what noise explains."""
+    """1 sigma of the place of the stretch as a whole, from how it waves: means over about 1 m, less what noise explains.
+
+    Bulges go on for some metres: so many means tell as much as one.
+    """
     bins = max(2, int(length))
     index = np.clip(((s / length + 0.5) * bins).astype(np.int64), 0, bins - 1)
     n = np.bincount(index, minlength=bins)
@@ -110,7 +115,8 @@ def _waviness(s: Array, r: Array, length: float) -> float:
         return 0.0
     means = np.bincount(index, r, minlength=bins)[full] / n[full]
     explained = float(np.mean(np.var(r) / n[full]))
-    return float(np.sqrt(max(float(np.mean(means**2)) - explained, 0.0)))
+    independent = max(1.0, float(full.sum()) / BULGE_M)
+    return float(np.sqrt(max(float(np.mean(means**2)) - explained, 0.0) / independent))
 
 
 def _join(before: EdgeFit | None, after: EdgeFit | None, corner: Array) -> list[Array]:

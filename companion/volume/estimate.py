@@ -9,16 +9,20 @@ from scipy import ndimage
 
 from companion.config import VolumeConfig
 from companion.messages import Array, PointMap, VolumeReport
+from companion.volume.contact import Contact, fit_contact
 from companion.volume.doubt import doubt
 from companion.volume.floor import Floor, fit_floor, level_floor
-from companion.volume.grid import Grid, Mask, cells_of, disc, grid_around
+from companion.volume.grid import Grid, Index, Mask, cells_of, disc, grid_around
 from companion.volume.interval import Evidence, error_budget, interval
 from companion.volume.objects import find_objects
-from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells
+from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells, without_strays
 from companion.volume.walls import Footprint, find_footprint
 
 MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
+
+LEAST_KEYFRAMES = 6  # that see the floor, before their disagreement on it is judged
+BESIDE_WALLS_M = 1.0  # beyond the strip
 
 
 def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float | None = None) -> VolumeReport:
@@ -46,6 +50,8 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
     low = points[:, 2] < footprint.ceiling_m
     wanted = (key >= 0) & low & ~strip.ravel()[np.maximum(key, 0)]
     cells = robust_cells(points, np.where(wanted, key, -1), grid)
+    if footprint.has_walls:
+        cells = without_strays(cells, grid, footprint.depth_m < footprint.margin_m + BESIDE_WALLS_M)
     usable = cells.seen & (footprint.share > 0)
     if usable.sum() < 20:
         return _nothing(cfg, "the map shows no surface within the walls")
@@ -56,7 +62,21 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
     surface = build_surface(
         grid, cells, footprint.share > 0, strip, reach_m=INTERPOLATION_REACH_M, strip_width_m=footprint.margin_m
     )
-    return _report(point_map, cfg, grid, footprint, cells, floor, surface)
+    surface, contact = _meet_walls(points, grid, np.where(low, key, -1), footprint, floor, surface)
+    return _report(point_map, cfg, grid, footprint, cells, floor, surface, contact)
+
+
+def _meet_walls(
+    points: Array, grid: Grid, key: Index, footprint: Footprint, floor: Floor, surface: Surface
+) -> tuple[Surface, Contact]:
+    """The surface brought to where the walls' returns say that it meets them."""
+    strip = (np.abs(footprint.depth_m) < footprint.margin_m + 0.5 * grid.cell_m) & (footprint.share > 0)
+    x, y = grid.centres()
+    contact = fit_contact(
+        grid, points, key, footprint.polygon_m, surface.carried_m, surface.carried_m - floor.z(x, y), strip,
+        width_m=footprint.margin_m + grid.cell_m, noise_m=footprint.noise_m,
+    )  # fmt: skip
+    return replace(surface, z_m=surface.z_m + contact.rise_m), contact
 
 
 def _report(
@@ -67,6 +87,7 @@ def _report(
     cells: Cells,
     floor: Floor,
     surface: Surface,
+    contact: Contact,
 ) -> VolumeReport:
     x, y = grid.centres()
     floor_z = np.where(footprint.share > 0, floor.z(x, y), np.nan)
@@ -83,10 +104,13 @@ def _report(
     area = grid.cell_area_m2 * footprint.share
     volume = float(np.sum((height * area)[pile]))
     position_sigma = max(point_map.position_sigma_m, footprint.pose_sigma_m)
+    # A rise of the whole map changes no volume: where the keyframes' own disagreement is seen, it is what counts.
+    disagreement = keyframe_height_sigma(point_map, cells, floor)
     evidence = Evidence(
         grid=grid,
         cells=cells,
         surface=surface,
+        contact=contact,
         floor=floor,
         height_m=height,
         share=footprint.share,
@@ -94,7 +118,8 @@ def _report(
         depth_m=footprint.depth_m,
         has_walls=footprint.has_walls,
         position_sigma_m=position_sigma,
-        height_sigma_m=max(point_map.height_sigma_m, keyframe_height_sigma(point_map, cells, floor)),
+        height_sigma_m=point_map.height_sigma_m if disagreement is None else disagreement,
+        floor_disagreement_m=disagreement or 0.0,
         wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, 0.005)) if footprint.has_walls else 0.0,
     )
     total = float(area.sum())
@@ -142,23 +167,25 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
     return np.asarray(ndimage.binary_dilation(core, disc(cells_of(1.0, grid))) & inside)
 
 
-def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> float:
-    """How far the keyframes disagree on the floor's height, 1 sigma, less what noise explains."""
+def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> float | None:
+    """How far the keyframes disagree on the floor's height, 1 sigma, but for what noise may hide; None: too few see it."""
     on_floor = cells.of_point >= 0
     on_floor[on_floor] = floor.cells.ravel()[cells.of_point[on_floor]]
     index = np.flatnonzero(on_floor)
     if len(index) < 100:
-        return 0.0
+        return None
     points = point_map.points_map[index]
     r = points[:, 2] - floor.z(points[:, 0], points[:, 1])
     _, of_keyframe = np.unique(point_map.keyframe_id[index], return_inverse=True)
     n = np.bincount(of_keyframe)
     seen = n >= 20
-    if seen.sum() < 3:
-        return 0.0
+    if seen.sum() < LEAST_KEYFRAMES:
+        return None
     means = np.bincount(of_keyframe, r)[seen] / n[seen]
     spread = (1.4826 * float(np.median(np.abs(means - np.median(means))))) ** 2
-    return float(np.sqrt(max(spread - float(np.mean(np.var(r) / n[seen])), 0.0)))
+    # No less than what noise could hide.
+    explained = float(np.mean(np.var(r) / n[seen]))
+    return float(np.sqrt(max(spread - explained, explained)))
 
 
 def _only(point_map: PointMap, keep: Mask) -> PointMap:

@@ -12,6 +12,7 @@ from companion.volume.grid import Grid, Index, Mask, cells_of, disc
 
 MAX_SLOPE = 0.12  # steeper than any floor that trucks drive on; loose material at rest is far steeper
 TRIALS = 500
+LEAST_CELLS = 50  # of bare floor, away from all that rises
 BLOCK_M = 3.0  # floors undulate over a few metres: residuals are judged in blocks of this size
 
 
@@ -66,6 +67,8 @@ def fit_floor(grid: Grid, x: Array, y: Array, z: Array, sigma: Array, usable: Ma
         spread = 1.4826 * float(np.median(np.abs(pz[chosen] - design[chosen] @ plane)))
         tolerance = float(np.clip(3.5 * spread, 0.03, tolerance))
     chosen = cells.ravel()[index]
+    if _is_toe(grid, index, design, pz, plane, chosen, cells):
+        cells, chosen = nothing, np.zeros_like(chosen)
     return _judged(grid, plane, centre, design, pz, chosen, cells, index)
 
 
@@ -122,7 +125,19 @@ def _floor_cells(grid: Grid, index: Index, design: Array, z: Array, plane: Array
     rising = (mean > 0.6) & (share > 0.05)
     near_rising = ndimage.binary_dilation(rising, disc(cells_of(0.75, grid)))
     chosen = on & ~near_rising
-    return np.asarray(chosen if chosen.sum() >= 50 else on)
+    return np.asarray(chosen if chosen.sum() >= LEAST_CELLS else on)
+
+
+def _is_toe(grid: Grid, index: Index, design: Array, z: Array, plane: Array, chosen: Mask, cells: Mask) -> bool:
+    """Whether what was taken as floor is but the toe of a pile: everything beside it rises, nothing goes on level."""
+    if not chosen.any():
+        return False
+    beside = ndimage.binary_dilation(cells, disc(cells_of(0.75, grid)))
+    around = beside.ravel()[index] & ~chosen
+    r = z - design @ plane
+    spread = 3.0 * max(1.4826 * float(np.median(np.abs(r[chosen]))), 0.02)
+    rising = int((r[around] > spread).sum())
+    return chosen.sum() < LEAST_CELLS or rising > 2 * int(chosen.sum())
 
 
 def _judged(

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from companion.messages import Array
+from companion.volume.contact import Contact
 from companion.volume.floor import BLOCK_M, Floor
 from companion.volume.grid import Grid, Mask
 from companion.volume.surface import Cells, CellState, Surface
@@ -29,6 +30,7 @@ class Evidence:
     grid: Grid
     cells: Cells
     surface: Surface
+    contact: Contact
     floor: Floor
     height_m: Array
     share: Array
@@ -37,6 +39,7 @@ class Evidence:
     has_walls: bool
     position_sigma_m: float
     height_sigma_m: float
+    floor_disagreement_m: float
     wall_sigma_m: float
 
 
@@ -53,7 +56,8 @@ def error_budget(e: Evidence) -> dict[str, float]:
         "height": e.height_sigma_m * pile_area / POSE_SIDES,
         "range": RANGE_BIAS_SIGMA_M * (0.3 * pile_area + 0.7 * sum(flanks)),
         "floor": _floor(e, area),
-        "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _contact(e),
+        "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _face(e),
+        "contact": _contact_height(e, area),
         "interpolated": gaps,
         "unseen": hidden,
         "obstacles": _obstacles(e),
@@ -88,12 +92,19 @@ def _floor(e: Evidence, area: Array) -> float:
     return math.sqrt(max(plane, 0.0) + hidden)
 
 
-def _contact(e: Evidence) -> float:
+def _face(e: Evidence) -> float:
     """Face of the pile against the walls, m2: what a metre of error in a wall's place would add."""
     if not e.has_walls:
         return 0.0
     band = (np.abs(e.depth_m) < e.grid.cell_m) & (e.share > 0)
     return float(np.sum(np.maximum(e.height_m, 0.0)[band & e.pile])) * e.grid.cell_m / 2.0
+
+
+def _contact_height(e: Evidence, area: Array) -> float:
+    """Height at which the material meets the walls; neighbouring steps share their returns."""
+    known = e.contact.step >= 0
+    each = np.bincount(e.contact.step[known], (area * e.contact.sigma_m)[known])
+    return math.sqrt(2.0 * float(np.sum(each**2)))
 
 
 def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:

@@ -36,6 +36,26 @@ def edge_distance(polygon: Array, x: Array, y: Array) -> Array:
     return best
 
 
+def along_edges(polygon: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Of each of (N,) places: how far along the counter-clockwise polygon its nearest place on an edge lies, its
+    distance from there (positive inside), and that edge's inward normal (N, 2)."""
+    best, along, begin = np.full(x.shape, np.inf), np.zeros(x.shape), 0.0
+    normal = np.zeros((*x.shape, 2))
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        d = b - a
+        length = float(np.hypot(d[0], d[1]))
+        if length == 0.0:
+            continue
+        d = d / length
+        t = np.clip((x - a[0]) * d[0] + (y - a[1]) * d[1], 0.0, length)
+        away = np.hypot(x - a[0] - t * d[0], y - a[1] - t * d[1])
+        nearer = away < best
+        best, along = np.where(nearer, away, best), np.where(nearer, begin + t, along)
+        normal[nearer] = -d[1], d[0]
+        begin += length
+    return along, np.where(contains(polygon, x, y), best, -best), normal
+
+
 def coverage(polygon: Array, grid: Grid, *, sub: int = 5) -> Array:
     """Share of each cell that lies inside the polygon, (ny, nx); by sub x sub samples near the edges."""
     cx, cy = grid.centres()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -89,6 +89,34 @@ def robust_cells(points: Array, key: Index, grid: Grid) -> Cells:
     )
 
 
+def without_strays(cells: Cells, grid: Grid, where: Mask) -> Cells:
+    """Cells within `where` that stand above, or sink below, most of their neighbours by more than any slope of loose
+    material are taken out: beside a wall, where the material itself is hidden, a few stray returns of it make such."""
+    z = np.where(cells.seen, cells.z, np.nan)
+    reach = cells_of(0.75, grid)
+    padded = np.pad(z, reach, constant_values=np.nan)
+    off, known = np.zeros(grid.shape), np.zeros(grid.shape)
+    for i, j in np.argwhere(disc(reach)) - reach:
+        if i == j == 0:
+            continue
+        beside = padded[reach + i : reach + i + grid.ny, reach + j : reach + j + grid.nx]
+        apart = np.abs(z - beside)
+        known += np.isfinite(apart)
+        with np.errstate(invalid="ignore"):
+            off += apart > MAX_SLOPE * np.hypot(i, j) * grid.cell_m + 0.3
+    stray = where & (off > 0.5 * known)
+    of_point = np.where((cells.of_point >= 0) & stray.ravel()[np.maximum(cells.of_point, 0)], -1, cells.of_point)
+    return replace(
+        cells,
+        x=np.where(stray, np.nan, cells.x),
+        y=np.where(stray, np.nan, cells.y),
+        z=np.where(stray, np.nan, cells.z),
+        sigma_m=np.where(stray, np.nan, cells.sigma_m),
+        kept=np.where(stray, 0.0, cells.kept),
+        of_point=of_point,
+    )
+
+
 def _upright(scale: Array, n: Array, grid: Grid) -> Mask:
     """Cells whose returns spread in height as no surface's do: the rim of something upright. They are not believed."""
     usual = float(np.median(scale[n >= MIN_POINTS])) if (n >= MIN_POINTS).any() else 0.0
@@ -161,10 +189,12 @@ def _scale(r: Array, key: Index, grid: Grid, n: Array) -> Array:
 class Surface:
     """Height at the centre of every cell inside the walls. All (ny, nx).
 
-    z_m: NaN outside. state: CellState. gap_m: distance to the nearest seen cell. slope: magnitude of the local slope.
+    z_m: NaN outside. carried_m: the same, carried on beyond the walls. state: CellState. gap_m: distance to the nearest
+    seen cell. slope_x, slope_y: of the local plane.
     """
 
     z_m: Array
+    carried_m: Array
     state: NDArray[np.int8]
     gap_m: Array
     slope_x: Array
@@ -199,6 +229,7 @@ def build_surface(
     state[~inside] = CellState.OUTSIDE
     return Surface(
         z_m=np.where(inside, z, np.nan),
+        carried_m=z,
         state=state,
         gap_m=gap,
         slope_x=np.nan_to_num(planes.slope_x),

@@ -87,6 +87,23 @@ def test_millimetres_are_noticed_and_scale_mends_them(tmp_path: Path) -> None:
     assert measure(tmp_path / "mm.ply", scale=0.001)[0]["volume_m3"] == pytest.approx(TRUE_M3, rel=0.01)
 
 
+def test_centimetres_are_noticed(tmp_path: Path) -> None:
+    save_point_map(heap(scale=100.0), tmp_path / "cm.ply")
+    with pytest.raises(FileFormatError, match=r"--scale 0\.01,"):
+        measure(tmp_path / "cm.ply")
+
+
+@pytest.mark.parametrize(("stored", "told"), [(np.float32, True), (np.float64, False)])
+def test_survey_coordinates_in_single_precision_are_told(tmp_path: Path, stored: type, told: bool) -> None:
+    whole = heap()
+    points = (whole.points_map + [431_000.0, 5_412_000.0, 312.0]).astype(stored).astype(np.float64)
+    far = PointMap(points_map=points, keyframe_id=whole.keyframe_id, range_m=whole.range_m, path_map=whole.path_map)
+    save_point_map(far, tmp_path / "utm.ply")
+    report = measure(tmp_path / "utm.ply")[0]
+    assert any("steps of 0.5 m" in w for w in report["warnings"]) == told
+    assert report["volume_m3"] == pytest.approx(TRUE_M3, rel=0.02)
+
+
 def test_floor_by_hand_is_taken(cloud: Path) -> None:
     report, volume, _ = measure(cloud, floor="1.0")
     assert np.nanmax(volume.floor_z_m) == 1.0

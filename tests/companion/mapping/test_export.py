@@ -113,10 +113,16 @@ def test_ascii_ply_with_faces_and_colours_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["0 0 1\n2 0 1.5\n0 2 -3\n", "x,y,z\n0,0,1\n2,0,1.5\n0,2,-3\n", "0;0;1;9\n2;0;1.5;9\n0;2;-3;9\n"]
+    "text",
+    [
+        "0 0 1\n2 0 1.5\n0 2 -3\n",
+        "x,y,z\n0,0,1\n2,0,1.5\n0,2,-3\n",
+        "0;0;1;9\n2;0;1.5;9\n0;2;-3;9\n",
+        "# H\xf6he\n0 0 1\n2 0 1.5\n0 2 -3\n",
+    ],
 )
 def test_text_clouds_are_read(tmp_path: Path, text: str) -> None:
-    (tmp_path / "a.xyz").write_text(text)
+    (tmp_path / "a.xyz").write_text(text, encoding="latin-1")
     assert (load_point_map(tmp_path / "a.xyz").points_map == XYZ).all()
 
 
@@ -138,6 +144,14 @@ def test_las_of_another_program_is_read(tmp_path: Path) -> None:
         ("a.ply", (HEADER.format("binary_little_endian") + "end_header\n").encode() + b"\0" * 20, "cut short"),
         ("a.ply", (HEADER.format("ascii") + "end_header\n0 0 1\n").encode(), "3 rows"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", "x, y and z"),
+        ("a.ply", HEADER.format("ascii").replace("vertex 3", "vertex -3").encode() + b"end_header\n", "-3 rows"),
+        ("a.ply", (HEADER.format("ascii") + "property float x\nend_header\n").encode(), "line 8.*'x' already"),
+        (
+            "a.ply",
+            (HEADER.replace("3\n", "9999999999999\n").format("binary_little_endian") + "end_header\n").encode(),
+            "cut",
+        ),
+        ("a.csv", b"x;y;z\n1,5;2,5;3,5\n", "decimal commas"),
         ("a.las", b"LASFgarbage", "LAS"),
         ("a.laz", b"nothing of the kind", "LAS"),
         ("a.xyz", b"hello world\n", "x, y, z"),

@@ -35,6 +35,7 @@ HALLS = {
     "free-standing": Hall(footprint=rectangle(), pile=ridge(25, 15, 6, 6.0, 0.7)),
     "turned hall": Hall(footprint=rotated(rectangle(), 0.4), pile=cone(CENTRE[0], CENTRE[1], 6.5, 0.65)),
     "leaning on a wall": Hall(footprint=rectangle(), pile=leaning(30.0, 25, 8, 6.0, 0.7)),
+    "crest beside a wall": Hall(footprint=rectangle(45, 28), pile=ridge(24, 27, 8, 5.5, 0.67, 0.2)),
     "L-shaped": Hall(footprint=l_shape(), pile=cone(15, 15, 5.5, 0.6)),
     "silo": Hall(footprint=circle(15), pile=cone(0, 0, 6, 0.6)),
     "columns": Hall(
@@ -69,6 +70,35 @@ def test_interval_holds_the_truth_with_good_poses(name: str) -> None:
     assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
     assert abs(error) < 1.0
     assert report.interval_m3[1] - report.interval_m3[0] < 0.05 * synthetic.true_volume_m3
+
+
+def test_material_meets_the_wall_where_the_walls_returns_end() -> None:
+    hall = HALLS["crest beside a wall"]
+    report, _ = measured(make_map(hall, QUICK, 1))
+    x, y = np.meshgrid(report.x_m, report.y_m)
+    at_the_wall = (y > 27.5) & (y < 28.0) & (x > 17) & (x < 31)
+    error = (report.surface_z_m - report.floor_z_m - hall.pile(x, y))[at_the_wall]
+    assert abs(error.mean()) < 0.06  # carried on from before the crest it was 0.17 too high
+    assert error.std() < 0.2
+
+
+def test_stray_returns_of_the_wall_make_no_peak_beside_it() -> None:
+    synthetic = make_map(HALLS["crest beside a wall"], QUICK, 1)
+    there = synthetic.point_map
+    before = estimate_volume(there, CFG)
+    strays = np.random.default_rng(0).normal([24.6, 27.45, 8.5], 0.02, (4, 3))
+    hidden = np.hypot(*(there.points_map[:, :2] - [24.6, 27.45]).T) > 0.4
+    points = np.concatenate([there.points_map[hidden], strays])
+    none = np.zeros(4)
+    with_strays = dataclasses.replace(
+        there,
+        points_map=points,
+        keyframe_id=np.append(there.keyframe_id[hidden], none.astype(np.int64)),
+        range_m=np.append(there.range_m[hidden], none),
+    )
+    after = estimate_volume(with_strays, CFG)
+    assert after.volume_m3 == pytest.approx(before.volume_m3, abs=0.25)
+    assert np.nanmax(after.surface_z_m) < 7.0
 
 
 def test_walls_are_found_where_they_are(free_standing: Synthetic) -> None:
@@ -126,6 +156,48 @@ def test_heap_in_the_open_needs_no_walls() -> None:
     report = estimate_volume(cloud(np.column_stack([xy, z])), CFG)
     assert report.volume_m3 == pytest.approx(np.pi * 4.0**3 / 0.6**2 / 3, rel=0.01)
     assert any("no closed walls" in w for w in report.warnings)
+
+
+def heap_in_the_open(upwards: float) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    xy = rng.uniform([-20, -15], [20, 15], (100_000, 2))
+    return np.column_stack([xy, upwards * np.maximum(4.0 - 0.6 * np.hypot(*xy.T), 0.0) + rng.normal(0, 0.03, len(xy))])
+
+
+def test_z_that_points_down_is_told() -> None:
+    report = estimate_volume(cloud(heap_in_the_open(-1.0)), CFG)
+    assert any("below the floor" in w for w in report.warnings)
+    assert report.interval_m3[1] > 180.0
+    assert not any("below the floor" in w for w in estimate_volume(cloud(heap_in_the_open(1.0)), CFG).warnings)
+
+
+def test_heap_that_the_map_cuts_is_told_and_widens_the_interval() -> None:
+    points = heap_in_the_open(1.0)
+    report = estimate_volume(cloud(points[points[:, 0] > 0]), CFG)
+    assert any("goes on beyond" in w for w in report.warnings)
+    assert report.interval_m3[1] > 186.2
+    assert not any("goes on beyond" in w for w in estimate_volume(cloud(points), CFG).warnings)
+
+
+def test_attitude_that_is_off_is_told_and_widens_the_interval() -> None:
+    synthetic = make_map(
+        HALLS["free-standing"], dataclasses.replace(QUICK, tilt_sigma_rad=0.004, height_sigma_m=0.035), 3
+    )
+    report, _ = measured(synthetic)
+    assert any("disagree on the floor" in w for w in report.warnings)
+    assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
+
+
+def test_rise_of_the_whole_map_widens_no_interval(free_standing: Synthetic) -> None:
+    told = dataclasses.replace(free_standing.point_map, height_sigma_m=0.5)
+    assert estimate_volume(told, CFG).interval_m3 == estimate_volume(free_standing.point_map, CFG).interval_m3
+
+
+def test_toe_of_a_heap_is_no_floor() -> None:
+    points = heap_in_the_open(1.0)
+    report = estimate_volume(cloud(points[points[:, 2] > 0.8]), CFG)
+    assert any("no floor" in w for w in report.warnings)
+    assert report.interval_m3[0] <= 186.2 <= report.interval_m3[1]
 
 
 def test_dust_does_not_hide_the_walls() -> None:
