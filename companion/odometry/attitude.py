@@ -13,6 +13,7 @@ from companion.messages import Array, AttitudeSample
 from companion.odometry.jit import kernel
 
 HISTORY = 128  # samples; 2.5 s at 50 Hz
+STORE = 2048  # samples that lie side by side, so that the newest can be shown without copying them
 MAX_EXTRAPOLATION_S = 0.1  # beyond the newest sample the turn rate is carried on for this long
 
 
@@ -74,6 +75,7 @@ class AttitudeBuffer:
 
     def __init__(self) -> None:
         self.history: AttitudeHistory | None = None
+        self._t_ns, self._samples, self._end = np.empty(STORE, np.int64), np.empty((STORE, 4)), 0
         self.dropped = 0
 
     def add(self, sample: AttitudeSample) -> bool:
@@ -92,15 +94,23 @@ class AttitudeBuffer:
         roll, pitch, _ = rpy_from_quat(q)
         _, rate_y, rate_z = rate.tolist()
         yaw_rate = (rate_y * math.sin(roll) + rate_z * math.cos(roll)) / max(math.cos(pitch), 0.1)
-        row = np.array([[roll, pitch, 0.0, yaw_rate]])
-        t = np.array([sample.t_ns], np.int64)
-        if old is None:
-            self.history = AttitudeHistory(t, row, q, rate)
-            return True
-        dt_s = (sample.t_ns - int(old.t_ns[-1])) * 1e-9
-        row[0, 2] = old.values[-1, 2] + 0.5 * (yaw_rate + old.values[-1, 3]) * dt_s
-        keep = slice(-(HISTORY - 1), None)
-        self.history = AttitudeHistory(
-            np.concatenate((old.t_ns[keep], t)), np.concatenate((old.values[keep], row)), q, rate
-        )
+        row = roll, pitch, 0.0, yaw_rate
+        if old is not None:
+            *_, yaw, rate_before = old.values[-1].tolist()
+            dt_s = (sample.t_ns - int(old.t_ns[-1])) * 1e-9
+            row = roll, pitch, yaw + 0.5 * (yaw_rate + rate_before) * dt_s, yaw_rate
+        self._append(sample.t_ns, row, q, rate)
         return True
+
+    def _append(self, t_ns: int, row: tuple[float, float, float, float], q: Array, rate: Array) -> None:
+        """Write behind what is published; views of it stay as they are. A full store is left to those who read it."""
+        if self._end == len(self._t_ns):
+            keep = HISTORY - 1
+            t_old, old = self._t_ns[-keep:], self._samples[-keep:]
+            self._t_ns, self._samples = np.empty(STORE, np.int64), np.empty((STORE, 4))
+            self._t_ns[:keep], self._samples[:keep] = t_old, old
+            self._end = keep
+        self._t_ns[self._end], self._samples[self._end] = t_ns, row
+        self._end += 1
+        kept = slice(max(0, self._end - HISTORY), self._end)
+        self.history = AttitudeHistory(self._t_ns[kept], self._samples[kept], q, rate)
