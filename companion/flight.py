@@ -40,7 +40,6 @@ from companion.messages import (
 from companion.navigator import Navigator, NavigatorInput, NavigatorOutput
 from companion.navigator.guard import Guard, GuardInput
 from companion.odometry import Odometry, ScanResult
-from companion.volume import estimate_volume
 
 Tap = Callable[[topics.Topic, int, object], None]
 Source = tuple[str, int] | None
@@ -224,6 +223,8 @@ class Flight:
 
     def measure(self) -> VolumeReport:
         """The volume from the map so far: seconds of work."""
+        from companion.volume import estimate_volume  # not before: what it needs of scipy takes a second to load
+
         return estimate_volume(self.mapper.point_map(), self.config.volume)
 
     # ---- within -----------------------------------------------------------------------------------------------------
@@ -231,8 +232,7 @@ class Flight:
     def _send_odometry(self, estimate: OdometryEstimate, t_ns: int) -> None:
         if not self.session.send_odometry(estimate):
             return
-        state = self.session.vehicle_state(t_ns)
-        if self._sent_odometry_ns is not None and state.is_armed:
+        if self._sent_odometry_ns is not None and self.session.is_armed:
             self.odometry_max_gap_s = max(self.odometry_max_gap_s, (t_ns - self._sent_odometry_ns) * 1e-9)
         self._sent_odometry_ns = t_ns
 

@@ -55,7 +55,7 @@ def quat_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
 
 def rpy_from_quat(q_wxyz: Array) -> tuple[float, float, float]:
     """(roll, pitch, yaw), rad; pitch in [-pi/2, pi/2]."""
-    w, x, y, z = (float(v) for v in q_wxyz)
+    w, x, y, z = q_wxyz.tolist()
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -63,13 +63,12 @@ def rpy_from_quat(q_wxyz: Array) -> tuple[float, float, float]:
 
 
 def yaw_from_quat(q_wxyz: Array) -> float:
-    w, x, y, z = (float(v) for v in q_wxyz)
+    w, x, y, z = q_wxyz.tolist()
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def matrix_from_quat(q_wxyz: Array) -> Array:
-    """(3, 3) rotation matrix."""
-    w, x, y, z = (float(v) for v in q_wxyz)
+def rotation_matrix(w: float, x: float, y: float, z: float) -> Array:
+    """(3, 3) of a unit quaternion's parts."""
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -77,6 +76,11 @@ def matrix_from_quat(q_wxyz: Array) -> Array:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def matrix_from_quat(q_wxyz: Array) -> Array:
+    """(3, 3) rotation matrix."""
+    return rotation_matrix(*q_wxyz.tolist())
 
 
 def quat_from_rotvec(rotvec_rad: Array) -> Array:

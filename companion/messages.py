@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 def require_array(name: str, value: NDArray[np.generic], shape: tuple[int | None, ...]) -> None:
     """Raise ValueError unless `value` is an array of that shape (None: any length)."""
     got = getattr(value, "shape", None)
+    if got == shape:
+        return
     if got is None or len(got) != len(shape) or any(w is not None and w != g for w, g in zip(shape, got, strict=True)):
         want = "(" + ", ".join("N" if s is None else str(s) for s in shape) + ")"
         raise ValueError(f"{name}: expected an array of shape {want}, got {got if got is not None else type(value)}")
@@ -210,6 +212,10 @@ class WallRanges:
     right_m: float | None
     ranges_m: Array
     is_seen: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        require_array("ranges_m", self.ranges_m, (360,))
+        require_array("is_seen", self.is_seen, (360,))
 
 
 class SetpointKind(Enum):

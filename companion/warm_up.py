@@ -45,6 +45,7 @@ def warm_up(config: CompanionConfig) -> None:
         flight.mapper.add(result.levelled, result.estimate)
         estimate, walls = result.estimate, result.wall_ranges
         output = flight.navigator.step(t_ns, NavigatorInput(estimate=estimate, walls=walls, vehicle=state))
+        flight.session.send_wall_ranges(walls)
         flight.guard.check(output.setpoint, t_ns, GuardInput(estimate=estimate, walls=walls, vehicle=state))
         if n == SCANS - 1:
             layer = result.levelled.points_level[result.levelled.row == geometry.horizontal_row][:, :2]

@@ -1,7 +1,7 @@
 """Ouster packets to scans, sans-IO. The only file of the flight code that knows ouster-sdk.
 
-The vendor's SDK gives the packet's layout, its checksum and the beam geometry; the fields of a whole turn are then
-read in one numpy step. Facts on packets: Ouster "Sensor Data" chapter of the firmware user manual, v2.3 to v3.1.
+The vendor's SDK gives the packet's layout and the beam geometry; the fields of a whole turn are then read in one step.
+Facts on packets: Ouster "Sensor Data" chapter of the firmware user manual, v2.3 to v3.1.
 """
 
 # mypy: disable-error-code="name-defined,attr-defined"
@@ -18,6 +18,8 @@ from ouster.sdk import core
 
 from companion.config import LidarConfig
 from companion.errors import FileFormatError
+from companion.jit import kernel
+from companion.lidar.crc64 import TABLES, crc64
 from companion.lidar.sensor_clock import SensorClock
 from companion.messages import LidarGeometry, LidarScan
 
@@ -29,6 +31,8 @@ FRAMES_BACK = 8  # a frame this little older than the current one is late, not a
 
 _STANDARD_HEADER = struct.Struct("<HHQ")  # type, frame id, then 24 bits init id and 40 bits serial number
 _COLUMN_START = struct.Struct("<QH")  # stamp, measurement id
+_CHECKSUM = struct.Struct("<Q")
+CHECKSUM_SIZE = _CHECKSUM.size
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,10 +126,12 @@ class OusterDecoder:
         self._format = core.PacketFormat.from_info(info)
         self._pixel = _PIXELS[profile]
         self._is_standard = info.format.header_type == core.HeaderType.STANDARD and profile != "LEGACY"
-        self._has_identity = profile != "LEGACY"  # and a checksum
+        self._has_identity = profile != "LEGACY"
         self._columns_per_packet = int(info.format.columns_per_packet)
         self._expected_packets = int(info.format.lidar_packets_per_frame())
         self._packet_size = int(self._format.lidar_packet_size)
+        empty = np.zeros(self._packet_size, np.uint8)
+        self._has_checksum = self._has_identity and self._format.crc(empty) is not None
         self._header_size = int(self._format.packet_header_size)
         self._width = int(info.w)
         self._max_frame_id = int(self._format.max_frame_id)
@@ -142,6 +148,8 @@ class OusterDecoder:
         self._is_open = False
         self._is_restarted = False
         self._last: LidarScan | None = None
+        self._is_sound(empty.tobytes(), empty)  # compiles what decodes now, and not while packets wait
+        self._decode(0)
 
     @classmethod
     def from_config(cls, cfg: LidarConfig) -> OusterDecoder:
@@ -162,7 +170,7 @@ class OusterDecoder:
         stamp, measurement = _COLUMN_START.unpack_from(packet, self._header_size)
         if kind != PACKET_TYPE_LIDAR or measurement >= self._width:
             return self._drop("header")
-        if self._has_identity and not self._is_sound(array):
+        if self._has_checksum and not self._is_sound(packet, array):
             return self._drop("checksum")
         if not self._is_ours(init_id, serial, source, t_ns):
             return self._drop("foreign")
@@ -182,9 +190,11 @@ class OusterDecoder:
         fmt = self._format
         return PACKET_TYPE_LIDAR, int(fmt.frame_id(array)), int(fmt.init_id(array)), int(fmt.prod_sn(array))
 
-    def _is_sound(self, array: NDArray[np.uint8]) -> bool:
-        stored = self._format.crc(array)
-        return stored is None or stored in NO_CHECKSUM or stored == self._format.calculate_crc(array)
+    def _is_sound(self, packet: bytes, array: NDArray[np.uint8]) -> bool:
+        """Whether the checksum in the last eight bytes is that of all before it."""
+        end = len(packet) - CHECKSUM_SIZE
+        (stored,) = _CHECKSUM.unpack_from(packet, end)
+        return stored in NO_CHECKSUM or stored == crc64(array, end, TABLES)
 
     def _is_ours(self, init_id: int, serial: int, source: tuple[str, int] | None, t_ns: int) -> bool:
         if self._serial and serial != self._serial and self._has_identity:
@@ -241,27 +251,19 @@ class OusterDecoder:
         return [scan]
 
     def _decode(self, frame_id: int) -> LidarScan:
-        rows, columns = self.info.h, self.info.w
         column = np.frombuffer(b"".join(self._packets), dtype=self._dtype)["column"].reshape(-1)
-        measurement = column["measurement_id"].astype(np.intp)
-        is_valid = ((column["status"] & 1) == 1) & (measurement < columns)
-        measurement = measurement[is_valid]
-        pixel = column["pixel"][is_valid]
-        range_mm = np.zeros((columns, rows), dtype=np.uint32)
-        range_mm[measurement] = (pixel["range"] & self._pixel.range_mask).astype(np.uint32) << self._pixel.range_shift
-        signal = np.zeros((columns, rows), dtype=np.float32)
-        signal[measurement] = pixel["signal"]
-        column_valid = np.zeros(columns, dtype=np.bool_)
-        column_valid[measurement] = True
-        stamps = np.zeros(columns, dtype=np.int64)
-        stamps[measurement] = column["stamp"][is_valid].astype(np.int64)
+        pixel = column["pixel"]
+        range_m, signal, column_valid, stamps = _spread_columns(
+            column["measurement_id"], column["status"], column["stamp"], pixel["range"], pixel["signal"],
+            self._width, self._pixel.range_mask, self._pixel.range_shift,
+        )  # fmt: skip
         t_column = self._fill_stamps(stamps, column_valid) + (self.clock.offset_ns or 0)
         return LidarScan(
             t_ns=int(t_column[-1]),
             frame_id=frame_id,
             t_column_ns=t_column,
-            range_m=np.ascontiguousarray(range_mm.T.astype(np.float32) / np.float32(1000.0)),
-            signal=np.ascontiguousarray(signal.T),
+            range_m=range_m,
+            signal=signal,
             column_valid=column_valid,
             geometry=self.geometry,
         )
@@ -278,6 +280,37 @@ class OusterDecoder:
         nearest = known[np.maximum(np.searchsorted(known, index, side="right") - 1, 0)]
         filled: NDArray[np.int64] = stamps[nearest] + (index - nearest) * np.int64(self._period_ns)
         return filled
+
+
+@kernel
+def _spread_columns(
+    measurement_id: NDArray[np.uint16],
+    status: NDArray[np.unsignedinteger],
+    stamp: NDArray[np.uint64],
+    range_word: NDArray[np.unsignedinteger],
+    signal_word: NDArray[np.unsignedinteger],
+    columns: int,
+    range_mask: int,
+    range_shift: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], NDArray[np.int64]]:
+    """What came of a turn, (N,) columns and (N, rows) pixels in any order, each at its own place.
+
+    Returns: range_m, signal (rows, columns), whether a column came and its stamp in ns (columns,); 0 where it did not.
+    """
+    rows = range_word.shape[1]
+    range_m, signal = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
+    column_valid, stamps = np.zeros(columns, np.bool_), np.zeros(columns, np.int64)
+    for n in range(len(measurement_id)):
+        c = int(measurement_id[n])
+        if status[n] & 1 != 1 or c >= columns:
+            continue
+        for i in range(rows):
+            range_mm = (int(range_word[n, i]) & range_mask) << range_shift
+            range_m[i, c] = np.float32(range_mm) / np.float32(1000.0)
+            signal[i, c] = np.float32(signal_word[n, i])
+        column_valid[c] = True
+        stamps[c] = np.int64(stamp[n])
+    return range_m, signal, column_valid, stamps
 
 
 def _is_same(a: LidarScan, b: LidarScan) -> bool:

@@ -130,10 +130,11 @@ def _frames_agree(dialect: Dialect, vehicle: Vehicle, vision: Vision, attitude: 
     if estimate is None or attitude is None or flags is None or not dialect.is_vision_fused(flags):
         return None
     ours, theirs = estimate.q_map_body_wxyz, attitude.q_ref_body_wxyz
-    yaw = abs(wrap_angle(yaw_from_quat(ours) - yaw_from_quat(theirs)))
-    whole = 2.0 * math.acos(min(1.0, abs(float(ours @ theirs))))
+    along = abs(sum(a * b for a, b in zip(ours.tolist(), theirs.tolist(), strict=True)))
+    whole = 2.0 * math.acos(min(1.0, along))
     if whole <= _FRAME_TOLERANCE_RAD:
         return None
+    yaw = abs(wrap_angle(yaw_from_quat(ours) - yaw_from_quat(theirs)))
     return (
         f"frames: estimate and autopilot disagree by {math.degrees(whole):.0f} deg "
         f"({math.degrees(yaw):.0f} in heading; 10 allowed): is the LiDAR mounted as the mission file says?"

@@ -278,6 +278,10 @@ class MavlinkSession:
         return dialect is not None and self._hearing.timesync.missing(dialect.timesync_answers) is None
 
     @property
+    def is_armed(self) -> bool:
+        return self._hearing.vehicle.is_armed
+
+    @property
     def is_passive(self) -> bool:
         """The pilot has taken over, or the vehicle was already flying when we came."""
         return self._hearing.vehicle.joined_in_flight or self._hearing.vehicle.pilot_has_control

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.jit import kernel
 from companion.mavlink import frames, wire
 from companion.mavlink.dialect import FRAME_BODY_FRD, FRAME_LOCAL_NED
-from companion.messages import Setpoint, WallRanges
+from companion.messages import Array, Setpoint, WallRanges
 
 # POSITION_TARGET_TYPEMASK: position, acceleration and yaw ignored; velocity and yaw rate used. Both autopilots.
 VELOCITY_AND_YAW_RATE = 0x5C7
@@ -44,27 +48,11 @@ def pack_setpoint(setpoint: Setpoint, target_system: int, time_boot_ms: int) -> 
     )
 
 
-_BEARINGS = tuple(
-    tuple((k - _BEAMS_PER_SECTOR * sector - _BEAMS_PER_SECTOR // 2) % 360 for k in range(_BEAMS_PER_SECTOR))
-    for sector in range(SECTORS)
-)
-
-
 def pack_obstacles(ranges: WallRanges, *, min_range_m: float, max_range_m: float) -> bytes:
     """OBSTACLE_DISTANCE: 72 sectors of 5 degrees clockwise from forward, cm, BODY_FRD. Each is centred on its bearing
     and holds the nearest return; max + 1 where nothing was within reach, 65535 where nothing was seen."""
     max_cm = min(int(max_range_m * 100), 65533)
-    metres, seen = ranges.ranges_m.tolist(), ranges.is_seen.tolist()
-    distances = []
-    for bearings in _BEARINGS:
-        looked = [metres[b] for b in bearings if seen[b]]
-        nearest = min(looked, default=None)
-        if nearest is None or math.isnan(nearest):
-            distances.append(_UNKNOWN)
-        elif nearest * 100 > max_cm:
-            distances.append(max_cm + 1)
-        else:
-            distances.append(max(0, round(nearest * 100)))
+    distances = _sector_distances_cm(ranges.ranges_m, ranges.is_seen, max_cm).tolist()
     return wire.pack(
         wire.OBSTACLE_DISTANCE,
         ranges.t_ns // 1000,
@@ -77,3 +65,22 @@ def pack_obstacles(ranges: WallRanges, *, min_range_m: float, max_range_m: float
         0.0,
         FRAME_BODY_FRD,
     )
+
+
+@kernel
+def _sector_distances_cm(ranges_m: Array, is_seen: NDArray[np.bool_], max_cm: int) -> NDArray[np.int64]:
+    """(72,) of what was seen (360,) by whole degrees counter-clockwise; see pack_obstacles."""
+    out = np.empty(SECTORS, np.int64)
+    for sector in range(SECTORS):
+        nearest, is_known = np.inf, False
+        for k in range(_BEAMS_PER_SECTOR):
+            bearing = (k - _BEAMS_PER_SECTOR * sector - _BEAMS_PER_SECTOR // 2) % 360
+            if is_seen[bearing] and not math.isnan(ranges_m[bearing]):
+                nearest, is_known = min(nearest, ranges_m[bearing]), True
+        if not is_known:
+            out[sector] = _UNKNOWN
+        elif nearest * 100 > max_cm:
+            out[sector] = max_cm + 1
+        else:
+            out[sector] = max(0, round(nearest * 100))
+    return out

@@ -68,8 +68,8 @@ class Vision:
             + sum(estimate.q_map_body_wxyz.tolist())
             + sum(estimate.velocity_body_mps.tolist())
             + sum(estimate.rate_body_radps.tolist())
-            + float(estimate.pose_covariance.sum())
-            + float(estimate.velocity_covariance.sum())
+            + sum(estimate.pose_covariance.ravel().tolist())
+            + sum(estimate.velocity_covariance.ravel().tolist())
         )
         if not math.isfinite(total):
             return "not_finite"

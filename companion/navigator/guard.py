@@ -185,7 +185,7 @@ class Guard:
             return "registration failed"
         if t_ns - vehicle.t_heartbeat_ns > cfg.max_state_age_s * 1e9 + HEARTBEAT_NS:
             return "the vehicle's state is old"
-        if not (np.all(np.isfinite(setpoint.velocity_map_mps)) and math.isfinite(setpoint.yaw_rate_radps)):
+        if not (_is_finite(setpoint.velocity_map_mps) and math.isfinite(setpoint.yaw_rate_radps)):
             return "the setpoint is not a number"
         if _sigma_m(estimate) > cfg.max_position_sigma_m:
             return "the position is uncertain"
@@ -234,11 +234,12 @@ class Guard:
         assert self._estimate is not None
         cfg, here = self._cfg, self._estimate.position_map_m
         whys = []
-        xy, z = np.array(setpoint.velocity_map_mps[:2], dtype=np.float64), float(setpoint.velocity_map_mps[2])
+        vx, vy, z = (float(v) for v in setpoint.velocity_map_mps)
+        xy = np.array([vx, vy])
         top = cfg.max_speed_mps * (DEGENERATE_SPEED_RATIO if self._estimate.is_degenerate else 1.0)
-        speed = float(np.hypot(*xy))
+        speed = math.hypot(vx, vy)
         if speed > top:
-            xy, speed = xy * (top / speed), top
+            xy = xy * (top / speed)
             whys.append("too fast")
         z = max(-cfg.max_climb_speed_mps, min(cfg.max_climb_speed_mps, z))
         fenced, why = self._fence(xy)
@@ -262,7 +263,7 @@ class Guard:
         """Without what leads out of the circle about the start faster than it could stop inside."""
         assert self._estimate is not None
         off = self._estimate.position_map_m[:2] - self._start[:2]
-        distance = float(np.hypot(*off))
+        distance = math.hypot(off[0], off[1])
         if distance < 1e-6:
             return xy, ""
         outward = off / distance
@@ -299,9 +300,14 @@ def _sigma_m(estimate: OdometryEstimate) -> float:
 
 def _is_good(estimate: OdometryEstimate, t_ns: int) -> bool:
     """Finite, a unit quaternion, not called failed, not from the future."""
-    q = estimate.q_map_body_wxyz
-    finite = bool(np.all(np.isfinite(estimate.position_map_m)) and np.all(np.isfinite(q)))
-    return finite and abs(float(q @ q) - 1.0) < 1e-2 and estimate.quality >= 0 and estimate.t_ns <= t_ns
+    if not (_is_finite(estimate.position_map_m) and _is_finite(estimate.q_map_body_wxyz)):
+        return False
+    norm = sum(v * v for v in estimate.q_map_body_wxyz.tolist())
+    return abs(norm - 1.0) < 1e-2 and estimate.quality >= 0 and estimate.t_ns <= t_ns
+
+
+def _is_finite(vector: Array) -> bool:
+    return all(map(math.isfinite, vector.tolist()))
 
 
 def _is_new(walls: WallRanges, before: WallRanges | None, t_ns: int) -> bool:

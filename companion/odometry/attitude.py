@@ -13,30 +13,43 @@ from companion.messages import Array, AttitudeSample
 from companion.odometry.jit import kernel
 
 HISTORY = 128  # samples; 2.5 s at 50 Hz
+STORE = 2048  # samples that lie side by side, so that the newest can be shown without copying them
 MAX_EXTRAPOLATION_S = 0.1  # beyond the newest sample the turn rate is carried on for this long
 
 
 @kernel
-def _interpolate(
-    t_ns: NDArray[np.int64], sample_ns: NDArray[np.int64], values: Array, max_extrapolation_s: float
-) -> Array:
-    """Linear between the samples, the first and last ones before and after; yaw goes on at the last rate."""
+def interpolate_at(t_ns: int, sample_ns: NDArray[np.int64], samples: Array) -> tuple[float, float, float, float]:
+    """Linear between the samples, the first and last ones before and after; yaw goes on at the last rate.
+
+    sample_ns: (N,) rising. samples, and what it gives: roll, pitch, yaw, yaw rate.
+    """
     newest = len(sample_ns) - 1
+    if t_ns >= sample_ns[newest]:
+        beyond_s = min(float(t_ns - sample_ns[newest]) * 1e-9, MAX_EXTRAPOLATION_S)
+        last = samples[newest]
+        return last[0], last[1], last[2] + beyond_s * last[3], last[3]
+    after = newest
+    while after > 0 and sample_ns[after - 1] > t_ns:  # times asked for are mostly recent
+        after -= 1
+    if after == 0:
+        first = samples[0]
+        return first[0], first[1], first[2], first[3]
+    a, b = samples[after - 1], samples[after]
+    past, span = float(t_ns - sample_ns[after - 1]), float(sample_ns[after] - sample_ns[after - 1])
+    return (
+        (b[0] - a[0]) / span * past + a[0],
+        (b[1] - a[1]) / span * past + a[1],
+        (b[2] - a[2]) / span * past + a[2],
+        (b[3] - a[3]) / span * past + a[3],
+    )
+
+
+@kernel
+def _interpolate(t_ns: NDArray[np.int64], sample_ns: NDArray[np.int64], samples: Array) -> Array:
+    """(M, 4) `interpolate_at` each of (M,) times."""
     out = np.empty((len(t_ns), 4))
     for i in range(len(t_ns)):
-        t = t_ns[i]
-        if t >= sample_ns[newest]:
-            out[i] = values[newest]
-            beyond_s = min(float(t - sample_ns[newest]) * 1e-9, max_extrapolation_s)
-            out[i, 2] += beyond_s * values[newest, 3]
-            continue
-        after = np.searchsorted(sample_ns, t, side="right")
-        if after == 0:
-            out[i] = values[0]
-            continue
-        past, span = float(t - sample_ns[after - 1]), float(sample_ns[after] - sample_ns[after - 1])
-        for k in range(4):
-            out[i, k] = (values[after, k] - values[after - 1, k]) / span * past + values[after - 1, k]
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = interpolate_at(t_ns[i], sample_ns, samples)
     return out
 
 
@@ -50,7 +63,7 @@ class AttitudeHistory(NamedTuple):
 
     def at(self, t_ns: NDArray[np.int64]) -> Array:
         """(M, 4) roll, pitch, gyro yaw, yaw rate at those times; carried on a little beyond the newest sample."""
-        return _interpolate(t_ns, self.t_ns, self.values, MAX_EXTRAPOLATION_S)
+        return _interpolate(t_ns, self.t_ns, self.values)
 
 
 class AttitudeBuffer:
@@ -62,6 +75,7 @@ class AttitudeBuffer:
 
     def __init__(self) -> None:
         self.history: AttitudeHistory | None = None
+        self._t_ns, self._samples, self._end = np.empty(STORE, np.int64), np.empty((STORE, 4)), 0
         self.dropped = 0
 
     def add(self, sample: AttitudeSample) -> bool:
@@ -70,24 +84,33 @@ class AttitudeBuffer:
         if q.shape != (4,) or rate.shape != (3,) or not all(map(math.isfinite, (*q.tolist(), *rate.tolist()))):
             self.dropped += 1
             return False
-        norm = float(q @ q)
+        w, x, y, z = q.tolist()
+        norm = w * w + x * x + y * y + z * z
         old = self.history
         if not 0.81 < norm < 1.21 or (old is not None and sample.t_ns <= old.t_ns[-1]):
             self.dropped += 1
             return False
-        q = q / np.sqrt(norm)
+        q = q / math.sqrt(norm)
         roll, pitch, _ = rpy_from_quat(q)
-        cos_pitch = max(float(np.cos(pitch)), 0.1)
-        yaw_rate = float((rate[1] * np.sin(roll) + rate[2] * np.cos(roll)) / cos_pitch)
-        row = np.array([[roll, pitch, 0.0, yaw_rate]])
-        t = np.array([sample.t_ns], np.int64)
-        if old is None:
-            self.history = AttitudeHistory(t, row, q, rate)
-            return True
-        dt_s = (sample.t_ns - int(old.t_ns[-1])) * 1e-9
-        row[0, 2] = old.values[-1, 2] + 0.5 * (yaw_rate + old.values[-1, 3]) * dt_s
-        keep = slice(-(HISTORY - 1), None)
-        self.history = AttitudeHistory(
-            np.concatenate((old.t_ns[keep], t)), np.concatenate((old.values[keep], row)), q, rate
-        )
+        _, rate_y, rate_z = rate.tolist()
+        yaw_rate = (rate_y * math.sin(roll) + rate_z * math.cos(roll)) / max(math.cos(pitch), 0.1)
+        row = roll, pitch, 0.0, yaw_rate
+        if old is not None:
+            *_, yaw, rate_before = old.values[-1].tolist()
+            dt_s = (sample.t_ns - int(old.t_ns[-1])) * 1e-9
+            row = roll, pitch, yaw + 0.5 * (yaw_rate + rate_before) * dt_s, yaw_rate
+        self._append(sample.t_ns, row, q, rate)
         return True
+
+    def _append(self, t_ns: int, row: tuple[float, float, float, float], q: Array, rate: Array) -> None:
+        """Write behind what is published; views of it stay as they are. A full store is left to those who read it."""
+        if self._end == len(self._t_ns):
+            keep = HISTORY - 1
+            t_old, old = self._t_ns[-keep:], self._samples[-keep:]
+            self._t_ns, self._samples = np.empty(STORE, np.int64), np.empty((STORE, 4))
+            self._t_ns[:keep], self._samples[:keep] = t_old, old
+            self._end = keep
+        self._t_ns[self._end], self._samples[self._end] = t_ns, row
+        self._end += 1
+        kept = slice(max(0, self._end - HISTORY), self._end)
+        self.history = AttitudeHistory(self._t_ns[kept], self._samples[kept], q, rate)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ MIN_INLIER_RATIO = 0.3  # of the layer's points; a door that opens on a new hall
 MAX_SCALE = 2.8
 MAX_NIS = 30.0  # squared Mahalanobis distance of 3 degrees of freedom: one in 10^6 by chance
 ALWAYS_ALLOWED = np.array([0.05, 0.05, 0.008])  # m, m, rad
+_ALLOWED = tuple(ALWAYS_ALLOWED.tolist())
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +48,21 @@ def judge(registration: Registration, guess: Array, guess_covariance: Array, poi
 
 def weak_direction(information: Array) -> tuple[float, Array]:
     """Smaller eigenvalue over the sum, and its direction, of the translation's information."""
-    values, vectors = np.linalg.eigh(information[:2, :2])
-    total = float(values.sum())
+    a, b, c = float(information[0, 0]), float(information[0, 1]), float(information[1, 1])
+    total = a + c
     if total <= 0.0:
         return 0.0, np.array([1.0, 0.0])
-    return max(float(values[0]), 0.0) / total, np.asarray(vectors[:, 0])
+    angle = 0.5 * math.atan2(2.0 * b, a - c)  # of the greater one
+    smaller = 0.5 * total - math.hypot(0.5 * (a - c), b)
+    return max(smaller, 0.0) / total, np.array([-math.sin(angle), math.cos(angle)])
 
 
 def is_yaw_weak(information: Array) -> bool:
     """True when the walls alone leave yaw to more than 1 deg (round silo: turning changes nothing)."""
-    translation = information[:2, :2] + 1e-6 * np.eye(2)
-    left = information[2, 2] - information[2, :2] @ np.linalg.solve(translation, information[:2, 2])
-    return bool(left < 1.0 / np.radians(1.0) ** 2)
+    (a, b, u), (_, c, v), (_, _, yaw) = information.tolist()
+    a, c = a + 1e-6, c + 1e-6
+    left = yaw - (c * u * u - 2.0 * b * u * v + a * v * v) / (a * c - b * b)  # translation left free
+    return bool(left < 1.0 / math.radians(1.0) ** 2)
 
 
 def _refusal(registration: Registration, guess: Array, guess_covariance: Array, points: int) -> str:
@@ -65,10 +70,10 @@ def _refusal(registration: Registration, guess: Array, guess_covariance: Array, 
         return "too few inliers"
     if registration.scale > MAX_SCALE:
         return "residuals too large"
-    if not np.isfinite(registration.pose).all():
+    if not all(map(math.isfinite, registration.pose.tolist())):
         return "not finite"
     jump = registration.pose - guess
-    if (np.abs(jump) <= ALWAYS_ALLOWED).all():
+    if all(abs(off) <= allowed for off, allowed in zip(jump.tolist(), _ALLOWED, strict=True)):
         return ""
     noise = np.linalg.inv(registration.information + np.diag([1.0, 1.0, 10.0])) + np.diag(ALWAYS_ALLOWED**2) / 9.0
     nis = float(jump @ np.linalg.solve(guess_covariance + noise, jump))

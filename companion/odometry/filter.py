@@ -6,12 +6,14 @@ explain (wind, drag, attitude error); the last is what the gyro still reads at r
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.messages import Array
-from companion.odometry.attitude import AttitudeHistory
+from companion.odometry.attitude import AttitudeHistory, interpolate_at
 from companion.odometry.jit import kernel
 
 GRAVITY = 9.80665
@@ -21,6 +23,7 @@ ACCELERATION_WALK = 0.15  # m/s^2 per sqrt(s)
 YAW_NOISE = 0.001  # rad per sqrt(s)
 GYRO_WALK = 2e-5  # rad/s per sqrt(s)
 STEP_S = 0.02
+MAX_STEPS = 250
 N = 8
 
 
@@ -33,29 +36,48 @@ class Planar(NamedTuple):
 
 
 @kernel
-def _carry(x: Array, p: Array, roll: Array, pitch: Array, yaw_gyro: Array, step_s: float) -> tuple[Array, Array]:
-    """Carry state and covariance through samples of attitude, evenly spaced by step_s."""
+def _carry(
+    x: Array, p: Array, t_ns: int, span_ns: int, steps: int, sample_ns: NDArray[np.int64], samples: Array
+) -> tuple[Array, Array]:
+    """State and covariance carried on by span_ns from t_ns, in even steps, through the attitude as it was sampled.
+
+    sample_ns, samples: (N,), (N, 4) as of AttitudeHistory.
+    """
     x, p = x.copy(), p.copy()
-    f = np.eye(8)
-    for i in range(len(roll) - 1):
-        forward = min(max(9.80665 * np.tan(pitch[i]), -3.0), 3.0)
-        left = min(max(-9.80665 * np.tan(roll[i]), -3.0), 3.0)
-        c, s = np.cos(x[6]), np.sin(x[6])
+    step_s = float(span_ns) * 1e-9 / steps
+    roll, pitch, gyro_yaw, _ = interpolate_at(t_ns, sample_ns, samples)
+    for i in range(1, steps + 1):
+        forward = min(max(GRAVITY * math.tan(pitch), -MAX_ACCELERATION), MAX_ACCELERATION)
+        left = min(max(-GRAVITY * math.tan(roll), -MAX_ACCELERATION), MAX_ACCELERATION)
+        c, s = math.cos(x[6]), math.sin(x[6])
         ax, ay = c * forward - s * left + x[4], s * forward + c * left + x[5]
+        before = gyro_yaw
+        roll, pitch, gyro_yaw, _ = interpolate_at(t_ns + i * span_ns // steps, sample_ns, samples)
         x[0] += x[2] * step_s + 0.5 * ax * step_s**2
         x[1] += x[3] * step_s + 0.5 * ay * step_s**2
         x[2] += ax * step_s
         x[3] += ay * step_s
-        x[6] += yaw_gyro[i + 1] - yaw_gyro[i] - x[7] * step_s
-        f[0, 2] = f[1, 3] = f[2, 4] = f[3, 5] = step_s
-        f[6, 7] = -step_s
-        p = f @ p @ f.T
-        for k in range(2):
-            p[2 + k, 2 + k] += 0.08**2 * step_s
-            p[4 + k, 4 + k] += 0.15**2 * step_s
-        p[6, 6] += 0.001**2 * step_s
-        p[7, 7] += 2e-5**2 * step_s
+        x[6] += gyro_yaw - before - x[7] * step_s
+        _spread(p, step_s)
     return x, p
+
+
+@kernel
+def _spread(p: Array, step_s: float) -> None:
+    """F P F' plus noise, in place. F is the unit matrix and: position from velocity, velocity from b, yaw from offset."""
+    for k in range(N):
+        for i in range(4):
+            p[i, k] += step_s * p[i + 2, k]
+        p[6, k] -= step_s * p[7, k]
+    for k in range(N):
+        for i in range(4):
+            p[k, i] += step_s * p[k, i + 2]
+        p[k, 6] -= step_s * p[k, 7]
+    for k in range(2):
+        p[2 + k, 2 + k] += VELOCITY_NOISE**2 * step_s
+        p[4 + k, 4 + k] += ACCELERATION_WALK**2 * step_s
+    p[6, 6] += YAW_NOISE**2 * step_s
+    p[7, 7] += GYRO_WALK**2 * step_s
 
 
 def start(t_ns: int) -> Planar:
@@ -66,19 +88,23 @@ def start(t_ns: int) -> Planar:
 
 def carry(state: Planar, history: AttitudeHistory, t_ns: int) -> Planar:
     """The state at t_ns, by tilt and gyro; unchanged when t_ns is not later."""
-    dt_s = (t_ns - state.t_ns) * 1e-9
-    if dt_s <= 0.0:
+    span_ns = t_ns - state.t_ns
+    if span_ns <= 0:
         return state
-    steps = max(1, min(250, round(dt_s / STEP_S)))
-    times = state.t_ns + (np.arange(steps + 1) * (t_ns - state.t_ns)) // steps
-    a = history.at(times.astype(np.int64))
-    x, p = _carry(state.x, state.p, a[:, 0], a[:, 1], a[:, 2], dt_s / steps)
+    steps = max(1, min(MAX_STEPS, round(span_ns * 1e-9 / STEP_S)))
+    x, p = _carry(state.x, state.p, state.t_ns, span_ns, steps, history.t_ns, history.values)
     return Planar(t_ns, x, p)
 
 
+def velocity_level(planar: Planar, vertical: Vertical) -> Array:
+    """(3,) m/s in the z-up frame with the body's heading."""
+    vx, vy, yaw = float(planar.x[2]), float(planar.x[3]), float(planar.x[6])
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([c * vx + s * vy, -s * vx + c * vy, vertical.x[1]])
+
+
 POSE = [0, 1, 6]
-_C = np.zeros((3, N))
-_C[[0, 1, 2], POSE] = 1.0
+POSE_BLOCK = np.ix_(POSE, POSE)
 
 
 def update(
@@ -90,16 +116,35 @@ def update(
     apparent: (3, 3) the information that the registration itself went by.
     floor_variance: (3,) what a registration errs by however many points agree (the walls' own errors).
     """
-    shift = (apparent + prior_information) @ (pose - state.x[POSE])  # = apparent (ML pose - state's pose)
+    x, p = _update(
+        state.x, state.p, pose, np.ascontiguousarray(information), np.ascontiguousarray(apparent), prior_information,
+        floor_variance,
+    )  # fmt: skip
+    return Planar(state.t_ns, x, p)
+
+
+@kernel
+def _update(
+    x: Array, p: Array, pose: Array, information: Array, apparent: Array, prior: Array, floor_variance: Array
+) -> tuple[Array, Array]:
+    """State (8,) and covariance (8, 8) after a registration; arguments as of `update`, matrices C-contiguous."""
+    off = np.array([pose[0] - x[0], pose[1] - x[1], pose[2] - x[6]])
+    shift = (apparent + prior) @ off  # = apparent (ML pose - state's pose)
     gradient = information @ np.linalg.solve(apparent + 1e-3 * np.eye(3), shift)
     discount = np.linalg.inv(np.eye(3) + information * floor_variance)
     information = discount @ information
-    total = np.linalg.inv(state.p)
-    total[np.ix_(POSE, POSE)] += 0.5 * (information + information.T)
+    total = np.linalg.inv(p)
+    at = (0, 1, 6)  # POSE
+    for i in range(3):
+        for k in range(3):
+            total[at[i], at[k]] += 0.5 * (information[i, k] + information[k, i])
     p = np.linalg.inv(total)
     p = 0.5 * (p + p.T)
-    x = state.x + p[:, POSE] @ (discount @ gradient)
-    return Planar(state.t_ns, x, p)
+    pull = discount @ gradient
+    x = x.copy()
+    for i in range(N):
+        x[i] += p[i, 0] * pull[0] + p[i, 1] * pull[1] + p[i, 6] * pull[2]
+    return x, p
 
 
 class Vertical(NamedTuple):
@@ -121,18 +166,22 @@ def carry_vertical(state: Vertical, t_ns: int) -> Vertical:
     dt = (t_ns - state.t_ns) * 1e-9
     if dt <= 0.0:
         return state
-    p00, p01, p11 = state.p[0, 0], state.p[0, 1], state.p[1, 1]
+    (p00, p01), (_, p11) = state.p.tolist()
+    z, vz = state.x.tolist()
     q = CLIMB_NOISE**2 * dt
     a = p00 + 2 * dt * p01 + dt * dt * p11 + q * dt * dt / 3
     b = p01 + dt * p11 + q * dt / 2
-    return Vertical(t_ns, np.array([state.x[0] + dt * state.x[1], state.x[1]]), np.array([[a, b], [b, p11 + q]]))
+    return Vertical(t_ns, np.array([z + dt * vz, vz]), np.array([[a, b], [b, p11 + q]]))
 
 
 def update_vertical(state: Vertical, z_m: float, variance: float) -> Vertical:
-    gain = state.p[:, 0] / (state.p[0, 0] + variance)
-    x = state.x + gain * (z_m - state.x[0])
-    p = state.p - np.outer(gain, state.p[0])
-    return Vertical(state.t_ns, x, 0.5 * (p + p.T))
+    (p00, p01), (p10, p11) = state.p.tolist()
+    z, vz = state.x.tolist()
+    gain_z, gain_v = p00 / (p00 + variance), p10 / (p00 + variance)
+    off = z_m - z
+    cross = 0.5 * ((p01 - gain_z * p01) + (p10 - gain_v * p00))
+    p = np.array([[p00 - gain_z * p00, cross], [cross, p11 - gain_v * p01]])
+    return Vertical(state.t_ns, np.array([z + gain_z * off, vz + gain_v * off]), p)
 
 
 def let_go(state: Planar, gyro_offset_radps: float, stood_s: float) -> Planar:

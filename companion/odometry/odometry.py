@@ -7,6 +7,7 @@ walls of the first keyframe hold the pose for the whole flight.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,14 +32,14 @@ from companion.odometry.attitude import AttitudeBuffer, AttitudeHistory
 from companion.odometry.degeneracy import Judgement, judge, weak_direction
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
-from companion.odometry.level import Leveller, block_means
+from companion.odometry.level import Leveller, block_means, wall_layer
 from companion.odometry.ranges import wall_ranges
 from companion.odometry.relocalise import relocalise
 from companion.odometry.standstill import Standstill
 from companion.odometry.wall_map import Registration, WallMap
 
-PRIOR_SIGMA = np.array([0.06, 0.06, 0.02])  # m, m, rad: holds a registration where the walls do not
-FLOOR_SIGMA = np.array([0.004, 0.004, 0.0004])  # what a registration errs by at best: roughness, time stamps
+PRIOR_COVARIANCE = np.diag(np.array([0.06, 0.06, 0.02]) ** 2)  # m, m, rad: holds a registration where the walls do not
+FLOOR_VARIANCE = np.array([0.004, 0.004, 0.0004]) ** 2  # what a registration errs by at best: roughness, time stamps
 KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
 KEYFRAME_HEIGHT_LOW_M = 0.2  # below LOW_M, where nothing yet tells walls from the foot of a pile
 LOW_M = 1.5
@@ -147,18 +148,17 @@ class Odometry:
     ) -> ScanResult | None:
         for sample in samples:
             self.height.on_rangefinder(sample)
-            if np.isfinite(sample.distance_m):
+            if math.isfinite(sample.distance_m):
                 self._standstill.on_rangefinder(sample.distance_m)
         if self._is_unusable(scan, history) or history is None:
             return None
         old = self._snapshot
         planar = kalman.start(scan.t_ns) if old is None else kalman.carry(old.planar, history, scan.t_ns)
         vertical = kalman.start_vertical(scan.t_ns) if old is None else kalman.carry_vertical(old.vertical, scan.t_ns)
-        velocity = np.array([*(rotation2(-planar.x[6]) @ planar.x[2:4]), vertical.x[1]])
+        velocity = kalman.velocity_level(planar, vertical)
         levelled, every = self._leveller.level(scan, history, velocity, self.height.tilt_offset_rad)
         row = scan.geometry.horizontal_row
-        layer3 = levelled.points_level[levelled.row == row]
-        layer = np.ascontiguousarray(layer3[layer3[:, 2] > self.height.floor_below_m(vertical.x[0]), :2])
+        layer = wall_layer(levelled, row, self.height.floor_below_m(float(vertical.x[0])))
         near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
         lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None
@@ -175,7 +175,7 @@ class Odometry:
                     history, planar, vertical, registration, judgement, fit.correction[0], fit.z_sigma_m
                 )
             snapshot = self._after(old, scan, planar, vertical, registration, judgement, reset)
-        variance = np.append(np.diag(planar.p)[kalman.POSE], vertical.p[0, 0]) + snapshot.map_variance
+        variance = np.array([planar.p[0, 0], planar.p[1, 1], planar.p[6, 6], vertical.p[0, 0]]) + snapshot.map_variance
         if judgement is None or (judgement.is_accepted and not self._is_lost):
             self._pending.append(_Pending(layer, ground, planar.x[kalman.POSE], float(vertical.x[0]), variance))
             del self._pending[:-MAX_PENDING]
@@ -202,7 +202,7 @@ class Odometry:
             reason = "no attitude"
         elif self._snapshot is not None and scan.t_ns <= self._snapshot.t_scan_ns:
             reason = "repeated"
-        elif float(np.mean(scan.column_valid)) < self._least_valid_ratio():
+        elif np.count_nonzero(scan.column_valid) / len(scan.column_valid) < self._least_valid_ratio():
             reason = "too few columns"
         if reason:
             self.dropped[reason] += 1
@@ -236,8 +236,8 @@ class Odometry:
     ) -> tuple[kalman.Planar, Registration, Judgement, bool]:
         """Register the layer from the predicted pose; fuse it if it can be believed; search if it failed for long."""
         guess = planar.x[kalman.POSE]
-        covariance = planar.p[np.ix_(kalman.POSE, kalman.POSE)]
-        prior = np.asarray(np.linalg.inv(covariance + np.diag(PRIOR_SIGMA**2)), np.float64)
+        covariance = planar.p[kalman.POSE_BLOCK]
+        prior = np.asarray(np.linalg.inv(covariance + PRIOR_COVARIANCE), np.float64)
         registration = self.walls.register(layer, guess, prior, z_m=z_m, sigma_range_m=self._sigma_range_m)
         judgement = judge(registration, guess, covariance, len(layer))
         may_jump = judgement.is_accepted and not self._is_lost
@@ -251,7 +251,7 @@ class Odometry:
             self._accepted += 1
             self._track_noise(registration.scale)
             seen, apparent = registration.information, registration.apparent_information
-            planar = kalman.update(planar, registration.pose, seen, apparent, prior, FLOOR_SIGMA**2)
+            planar = kalman.update(planar, registration.pose, seen, apparent, prior, FLOOR_VARIANCE)
             was_weak, self._is_weak = self._is_weak, False
             return planar, registration, judgement, was_weak and _is_jump(planar.x, guess)
         self._rejected_in_row += 1
@@ -277,7 +277,7 @@ class Odometry:
     ) -> tuple[kalman.Planar, Registration, Judgement, bool]:
         """Register across the weak axis only; search along it once the position there is lost and walls are missing."""
         guess = planar.x[kalman.POSE]
-        covariance = planar.p[np.ix_(kalman.POSE, kalman.POSE)]
+        covariance = planar.p[kalman.POSE_BLOCK]
         planar = weak.settle(planar, axis, (planar.t_ns - before_ns) * 1e-9)
         noise, prior_held = self._sigma_range_m, weak.held(prior, axis)
         registration = self.walls.register(layer, guess, prior_held, z_m=z_m, sigma_range_m=noise)
@@ -296,7 +296,7 @@ class Odometry:
             self._accepted += 1
             self._track_noise(registration.scale)
             seen, apparent = weak.without_axis(registration, axis)
-            floor = FLOOR_SIGMA**2 + weak.axis_variance(sigma_m)
+            floor = FLOOR_VARIANCE + weak.axis_variance(sigma_m)
             planar = kalman.update(planar, registration.pose, seen, apparent, prior, floor)
         else:
             self._rejected_in_row += 1
@@ -325,7 +325,7 @@ class Odometry:
     def _track_noise(self, scale: float) -> None:
         """Learn the range noise from the residuals: fast at first, then slowly."""
         rate = max(0.01, 0.3 / (1 + self._accepted / 5))
-        self._sigma_range_m = float(np.clip(self._sigma_range_m * scale**rate, 0.01, 0.5))
+        self._sigma_range_m = min(max(self._sigma_range_m * scale**rate, 0.01), 0.5)
 
     def _stand(
         self,
@@ -412,4 +412,4 @@ class Odometry:
 
 
 def _is_jump(pose: Array, before: Array) -> bool:
-    return float(np.hypot(*(pose[:2] - before[:2]))) > MIN_JUMP_M
+    return math.hypot(pose[0] - before[0], pose[1] - before[1]) > MIN_JUMP_M

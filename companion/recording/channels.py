@@ -14,6 +14,8 @@ from companion.recording.mcap_write import Channel, Schema
 
 _RAW_SCHEMA = Schema(1, "stockpilot/Datagram", "ros1msg", b"string host\nuint16 port\nuint8[] data\n")
 _FOXGLOVE_FIRST = 2
+_LENGTH = struct.Struct("<I")
+_NO_SOURCE = b"\0\0\0\0\0\0"  # host "", port 0
 
 INPUTS = (
     "lidar",
@@ -58,14 +60,18 @@ def all_channels() -> list[Channel]:
 
 def pack_raw(data: bytes, source: tuple[str, int] | None) -> bytes:
     if source is None:
-        return b"\0\0\0\0\0\0" + struct.pack("<I", len(data)) + data
+        return _NO_SOURCE + _LENGTH.pack(len(data)) + data
     host = source[0].encode()
     return struct.pack(f"<I{len(host)}sHI", len(host), host, source[1] & 0xFFFF, len(data)) + data
 
 
 def unpack_raw(payload: bytes) -> Raw:
     """Raises: struct.error, UnicodeDecodeError: not a wrapped datagram."""
-    (host_length,) = struct.unpack_from("<I", payload)
+    if payload.startswith(_NO_SOURCE):
+        (length,) = _LENGTH.unpack_from(payload, len(_NO_SOURCE))
+        at = len(_NO_SOURCE) + _LENGTH.size
+        return Raw(payload[at : at + length], None)
+    (host_length,) = _LENGTH.unpack_from(payload)
     host, port, length = struct.unpack_from(f"<{host_length}sHI", payload, 4)
     at = 4 + host_length + 6
     return Raw(payload[at : at + length], (host.decode(), port) if host_length else None)

@@ -25,6 +25,7 @@ MAX_RECORD = 1 << 32
 MAX_CHUNK = 256 << 20
 _RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_FIXED = struct.Struct("<HIQQ")
+_MESSAGE_START = struct.Struct("<BQHIQQ")  # both of them
 _CHUNK_FIXED = struct.Struct("<QQQI")
 _COMPRESSIONS = ("", "lz4", "zstd")
 
@@ -75,6 +76,7 @@ class McapScan:
     orphans: int = field(init=False, default=0)
     is_finished: bool = field(init=False, default=False)  # data end, footer and closing magic are there
     _has_data_end: bool = field(init=False, default=False)
+    _bodies: dict[tuple[int, bytes], bytes] = field(init=False, default_factory=dict)  # of schemas and channels
 
     @property
     def is_whole(self) -> bool:
@@ -171,33 +173,39 @@ class McapScan:
 
     def _items(self, body: bytes, *, is_checked: bool = False) -> Iterator[Item]:
         at, end = 0, len(body)
-        channels = self.channels
+        channels, unpack, start = self.channels, _MESSAGE_START.unpack_from, _MESSAGE_START.size
         while at + 9 <= end:
-            opcode, length = _RECORD_HEAD.unpack_from(body, at)
-            at += 9
-            if at + length > end:
-                return
-            if opcode == op.MESSAGE:
-                channel_id, sequence, t_ns, publish_ns = _MESSAGE_FIXED.unpack_from(body, at)
+            if body[at] == op.MESSAGE:
+                _, length, channel_id, sequence, t_ns, publish_ns = unpack(body, at)
+                stop = at + 9 + length
+                if stop > end:
+                    return
                 channel = channels.get(channel_id)
                 if channel is None:
                     self.orphans += 1
                 else:
-                    yield Message(channel, sequence, t_ns, publish_ns, body[at + 22 : at + length])
+                    yield Message(channel, sequence, t_ns, publish_ns, body[at + start : stop])
             else:
-                item = self._item(opcode, body[at : at + length], is_checked=is_checked)
+                opcode, length = _RECORD_HEAD.unpack_from(body, at)
+                stop = at + 9 + length
+                if stop > end:
+                    return
+                item = self._item(opcode, body[at + 9 : stop], is_checked=is_checked)
                 if item is not None:
                     yield item
-            at += length
+            at = stop
 
     def _item(self, opcode: int, body: bytes, *, is_checked: bool = False) -> Item | None:
         """A schema, channel or message outside or inside a chunk; None if it was known already. A channel within a
         chunk whose checksum holds corrects one outside, where nothing guards it."""
+        key = opcode, body[:2]  # its id
+        if self._bodies.get(key) == body:
+            return None  # every chunk tells again what the first one told
         fields = _Fields(body)
         if opcode == op.SCHEMA:
             schema = Schema(fields.number("<H"), fields.text(), fields.text(), fields.blob("<I"))
             is_new = schema.id not in self.schemas
-            self.schemas[schema.id] = schema
+            self.schemas[schema.id], self._bodies[key] = schema, body
             return schema if is_new else None
         if opcode == op.CHANNEL:
             channel_id, schema_id = fields.number("<H"), fields.number("<H")
@@ -207,7 +215,7 @@ class McapScan:
                 return None
             if known is not None:
                 self.damage.append(Damage(0, 0, f"channel {known.topic!r} was altered: it is {channel.topic!r}"))
-            self.channels[channel_id] = channel
+            self.channels[channel_id], self._bodies[key] = channel, body
             return channel
         if opcode == op.MESSAGE:
             channel_id, sequence, t_ns, publish_ns = _MESSAGE_FIXED.unpack_from(body)

@@ -41,20 +41,24 @@ def iter_inputs(path: Path) -> Iterator[Input]:
             yield _input(item)
 
 
-def read_run(path: Path) -> RunRecording:
-    """All of a recording. Raises: FileFormatError: it is none of ours."""
+def read_run(path: Path, *, with_topics: bool = True) -> RunRecording:
+    """All of a recording; with_topics False: without the messages between the stages, which replay makes again.
+
+    Raises: FileFormatError: it is none of ours.
+    """
     file = recording_path(path)
     if file.name.endswith(SUFFIX):
         return unpack(file.read_bytes())
     run = RunRecording()
     scan = open_mcap(file)
+    inputs, topics = run.inputs, run.topics
     for item in scan:
         if isinstance(item, Message):
             topic = item.channel.topic
             if topic.startswith(channels.INPUT_PREFIX):
-                run.inputs.append(_input(item))
-            else:
-                run.topics.setdefault(topic, []).append((item.t_ns, item.data))
+                inputs.append(_input(item))
+            elif with_topics:
+                topics.setdefault(topic, []).append((item.t_ns, item.data))
         elif isinstance(item, Metadata):
             run.metadata[item.name] = dict(item.values)
         elif isinstance(item, Attachment):
@@ -71,4 +75,4 @@ def _input(message: Message) -> Input:
         data, source = channels.unpack_raw(message.data)
     except (struct.error, UnicodeDecodeError) as error:
         raise FileFormatError(f"recording: an input on {message.channel.topic} is not readable: {error}") from None
-    return Input(message.channel.topic.removeprefix(channels.INPUT_PREFIX), message.t_ns, data, source)
+    return Input(message.channel.topic[len(channels.INPUT_PREFIX) :], message.t_ns, data, source)

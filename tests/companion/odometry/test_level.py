@@ -10,7 +10,7 @@ import pytest
 
 from companion.config import LidarConfig
 from companion.messages import AttitudeSample, LidarScan
-from companion.odometry.attitude import AttitudeBuffer
+from companion.odometry.attitude import HISTORY, STORE, AttitudeBuffer
 from companion.odometry.level import Leveller, block_means
 from companion.odometry.ranges import wall_ranges
 from tests.companion.odometry.hall import Hall, Noise, Track, lidar_geometry, rectangle, stream
@@ -156,3 +156,19 @@ def test_attitude_is_interpolated_and_carried_on_a_little() -> None:
     stale = AttitudeSample(t_ns=5, q_ref_body_wxyz=np.array([1.0, 0, 0, 0]), rate_body_radps=np.zeros(3))
     assert not buffer.add(stale)
     assert buffer.dropped == 1
+
+
+def test_published_attitude_never_changes_however_many_samples_follow() -> None:
+    buffer, published = AttitudeBuffer(), []
+    for k in range(2 * STORE + 10):
+        angle = 0.001 * (k % 50)
+        q = np.array([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0])
+        assert buffer.add(AttitudeSample(t_ns=k, q_ref_body_wxyz=q, rate_body_radps=np.array([0.0, 0.0, 0.3])))
+        assert buffer.history is not None
+        if k % 50 == 0:
+            published.append((buffer.history, buffer.history.t_ns.copy(), buffer.history.values.copy()))
+    for history, t_ns, values in published:
+        np.testing.assert_array_equal(history.t_ns, t_ns)
+        np.testing.assert_array_equal(history.values, values)
+    newest = published[-1][0]
+    np.testing.assert_array_equal(newest.t_ns, newest.t_ns[-1] - np.arange(HISTORY)[::-1])

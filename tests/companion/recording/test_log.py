@@ -78,6 +78,10 @@ def test_inputs_come_back_in_order_to_the_byte(tmp_path: Path) -> None:
     assert run.metadata["run"] == {"mission": "m", "seed": "3"}
     assert run.metadata["outcome"] == {"state": "completed"}
     assert run.attachments == {"companion.json": b"{}"}
+    assert run.topics
+    without = read_run(tmp_path, with_topics=False)
+    assert without.inputs == run.inputs
+    assert not without.topics
 
 
 def test_every_topic_is_recorded_to_the_bit(tmp_path: Path) -> None:
