@@ -128,20 +128,56 @@ def column_motion(
     return motion
 
 
+def range_noise_m(range_m: NDArray[np.float32]) -> float:
+    """Standard deviation of one return, from neighbours in a layer, (columns,), 0: no return. NaN: too few of them.
+
+    Second differences leave out what a surface does that is straight over three columns; their median leaves out edges.
+    """
+    before, middle, after = range_m[:-2], range_m[1:-1], range_m[2:]
+    whole = (before > 0.0) & (middle > 0.0) & (after > 0.0)
+    bends = np.abs(before[whole] - 2.0 * middle[whole] + after[whole])
+    return float(np.median(bends)) / (0.6745 * math.sqrt(6.0)) if len(bends) >= MIN_BENDS else math.nan
+
+
+MIN_BENDS = 50
 BLOCK_RAD = math.radians(2.9)  # neighbours of a layer that are averaged: 4 of 512 columns
 BLOCK_SPAN_M = 0.6  # of range, about the block's median, beyond which a return is not the same surface
+SECTORS = 8  # of a turn: what is too near is told by a layer's median over one, not by the noise of a block
 
 
 def block_means(levelled: LevelledScan, above_row: int, columns: int, min_range_m: float) -> Array:
-    """(N, 3) means over blocks of neighbouring returns in each layer below `above_row`, levelled frame.
+    """Means over blocks of neighbouring returns in each layer below `above_row`: (N, 4) place in the levelled frame, and
+    how many returns each is the mean of.
 
     A lone return errs along its beam: its place and its height err together, and planes fitted to such points lean
-    along the beams. Averaging takes most of that away.
+    along the beams. Averaging takes most of that away. Where a layer's returns lie about min_range_m, taking those that
+    read longer would lower the ground by millimetres: so a block counts by the median of its whole sector.
     """
     size = max(1, round(columns * BLOCK_RAD / (2 * math.pi)))
+    is_far_enough = _sector_medians(levelled.range_m, levelled.row, levelled.column, columns) >= min_range_m
     return _block_means(
-        levelled.points_level, levelled.range_m, levelled.row, levelled.column, above_row, size, min_range_m
+        levelled.points_level, levelled.range_m, levelled.row, levelled.column, above_row, size, is_far_enough, columns
     )
+
+
+@kernel
+def _sector_medians(range_m: Array, row: NDArray[np.int64], column: NDArray[np.int64], columns: int) -> Array:
+    """(rows, SECTORS) median range of each layer's returns in each sector of the turn; 0 where there are none."""
+    rows = 0
+    for i in range(len(range_m)):
+        rows = max(rows, row[i] + 1)
+    held = np.empty((rows, SECTORS, columns // SECTORS + 1))
+    count = np.zeros((rows, SECTORS), np.int64)
+    for i in range(len(range_m)):
+        k, sector = row[i], column[i] * SECTORS // columns
+        held[k, sector, count[k, sector]] = range_m[i]
+        count[k, sector] += 1
+    out = np.zeros((rows, SECTORS))
+    for k in range(rows):
+        for sector in range(SECTORS):
+            if count[k, sector] > 0:
+                out[k, sector] = np.median(held[k, sector, : count[k, sector]])
+    return out
 
 
 @kernel
@@ -152,9 +188,11 @@ def _block_means(
     column: NDArray[np.int64],
     above_row: int,
     size: int,
-    min_range_m: float,
+    is_far_enough: NDArray[np.bool_],
+    columns: int,
 ) -> Array:
-    out = np.empty((len(range_m), 3))
+    """is_far_enough: (rows, SECTORS)."""
+    out = np.empty((len(range_m), 4))
     rows = 0
     for i in range(len(range_m)):
         rows = max(rows, row[i] + 1)
@@ -173,10 +211,13 @@ def _block_means(
             out[n] = 0.0
             for j in near:
                 if abs(range_m[j] - middle) <= BLOCK_SPAN_M:
-                    out[n] += points[j]
+                    for axis in range(3):
+                        out[n, axis] += points[j, axis]
                     used += 1
-            if 2 * used >= size and middle >= min_range_m:
+            sector = min(block[k] * size * SECTORS // columns, SECTORS - 1)
+            if 2 * used >= size and is_far_enough[k, sector]:
                 out[n] /= used
+                out[n, 3] = used
                 n += 1
             count[k] = 0
         if i < len(range_m) and row[i] > above_row:
