@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry import rpy_from_quat
+from companion.jit import kernel
 from companion.messages import Array, AttitudeSample
-from companion.odometry.jit import kernel
 
 HISTORY = 128  # samples; 2.5 s at 50 Hz
 STORE = 2048  # samples that lie side by side, so that the newest can be shown without copying them

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry import quat_from_rpy, rotation_matrix
+from companion.jit import kernel
 from companion.messages import Array, OdometryEstimate
 from companion.odometry.attitude import AttitudeHistory, interpolate_at
 from companion.odometry.filter import Planar, Vertical, carry, carry_vertical
-from companion.odometry.jit import kernel
 
 TILT_SIGMA_RAD = 0.005  # of roll and pitch as the flight controller gives them
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.jit import kernel
 from companion.messages import Array
 from companion.odometry.attitude import AttitudeHistory, interpolate_at
-from companion.odometry.jit import kernel
 
 GRAVITY = 9.80665
 MAX_ACCELERATION = 3.0  # m/s^2 that tilt is believed to give

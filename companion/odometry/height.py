@@ -14,9 +14,13 @@ from companion.odometry.attitude import AttitudeHistory
 from companion.odometry.height_map import HeightFit, HeightMap
 from companion.odometry.wall_map import WallMap
 
+BLOCK_SIGMA_RATIO = 0.5  # means of blocks of about four returns
 RANGEFINDER_SIGMA_M = 0.03
 RANGEFINDER_RADIUS_M = 1.0  # about the start: there the floor below is known from standing on it
 Z_FLOOR_SIGMA_M = 0.004
+START_RADIUS_M = 2.0  # about the start: ground that a standing LiDAR sees
+START_FLAT_M = 0.02  # RMS of the cells there about a plane, above which it is no floor
+START_CELLS = 6
 GATE_SIGMAS = 5.0
 MIN_GATE_M = 0.1
 MIN_GROUND_POINTS = 20
@@ -49,6 +53,7 @@ class HeightTracker:
         self._sensor_up_m = sensor_up_m
         self._rangefinder: deque[RangefinderSample] = deque(maxlen=64)
         self._rest: list[float] = []
+        self._floor_m: float | None = None  # by the LiDAR, once it has left the ground
         self._tilt = np.zeros(2)
         self._tilt_p = np.eye(2) * TILT_SIGMA_RAD**2
         self._highest_m = 0.0
@@ -61,8 +66,18 @@ class HeightTracker:
 
     @property
     def floor_m(self) -> float | None:
-        """Floor under the start, in map: known from the rangefinder while standing."""
-        return -float(np.median(self._rest)) if len(self._rest) >= 5 else None
+        """Floor under the start, in map: by the ground that the LiDAR saw around it while standing, where that is a plane;
+        else by the rangefinder, which on its legs reads near its least range, where only its longer readings come through.
+        """
+        if self._floor_m is not None:
+            return self._floor_m
+        return -float(np.mean(self._rest)) if len(self._rest) >= 5 else None
+
+    def leave_ground(self) -> None:
+        """Standing has ended: what the LiDAR saw of the floor until now is the best that will be known of it there."""
+        plane = self.ground.plane_about(0.0, 0.0, START_RADIUS_M)
+        if plane is not None and plane.rms_m < START_FLAT_M and plane.cells >= START_CELLS:
+            self._floor_m = plane.z_m
 
     def floor_below_m(self, z_m: float) -> float:
         """Levelled height under which a point of the horizontal layer is the floor, not a wall."""
@@ -87,7 +102,7 @@ class HeightTracker:
             planar.x[kalman.POSE],
             float(vertical.x[0]),
             walls,
-            sigma_range_m=0.5 * sigma_m,  # means of blocks of about four returns
+            sigma_range_m=BLOCK_SIGMA_RATIO * sigma_m,
             gate_m=0.5 + 3.0 * sigma_z,
             seen_spread_m=self._highest_m,
             tilt_information=np.asarray(np.linalg.inv(self._tilt_p), np.float64),

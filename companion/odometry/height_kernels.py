@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.jit import kernel
 from companion.messages import Array
-from companion.odometry.jit import kernel
 
 WINDOW = 1
 W, X, Y, Z, XX, XY, YY, XZ, YZ, ZZ, VZ = range(11)
@@ -35,30 +35,39 @@ BESIDE_M = 1.2  # where the ground at a wall's foot is not known, it is looked f
 def insert_heights(
     sums: Array,
     state: NDArray[np.uint8],
-    origin: Array,
+    corner: Array,
     cell_m: float,
-    points_map: Array,
-    distance_m: Array,
+    sight: Array,
+    origin: Array,
+    variance_range: float,
     variance_z: float,
 ) -> None:
-    """Add ground points (N, 3); far ones count less, since tilt errors grow with distance."""
+    """Add ground points, sight (N, 4: place, returns) from origin (3,); far ones count less, as tilt errors grow with
+    distance. variance_range: of one return.
+
+    A point errs along its beam, so its place and its height err together, and a plane through such points leans along the
+    beams. What the range's variance puts into the moments is known, and is taken out of them again.
+    """
     ny, nx = state.shape
-    for i in range(points_map.shape[0]):
-        x, y, z = points_map[i, 0], points_map[i, 1], points_map[i, 2]
-        ix, iy = math.floor((x - origin[0]) / cell_m), math.floor((y - origin[1]) / cell_m)
+    for i in range(sight.shape[0]):
+        dx, dy, dz = sight[i, 0], sight[i, 1], sight[i, 2]
+        x, y, z = origin[0] + dx, origin[1] + dy, origin[2] + dz
+        ix, iy = math.floor((x - corner[0]) / cell_m), math.floor((y - corner[1]) / cell_m)
         if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
             continue
-        w = 1.0 / (1.0 + (distance_m[i] * TILT_FAR_RAD / 0.06) ** 2)
+        far2 = dx * dx + dy * dy
+        noise = variance_range / (sight[i, 3] * max(far2 + dz * dz, 1e-6))
+        w = 1.0 / (1.0 + far2 * (TILT_FAR_RAD / 0.06) ** 2)
         s = sums[iy, ix]
         s[W] += w
         s[X] += w * x
         s[Y] += w * y
         s[Z] += w * z
-        s[XX] += w * x * x
-        s[XY] += w * x * y
-        s[YY] += w * y * y
-        s[XZ] += w * x * z
-        s[YZ] += w * y * z
+        s[XX] += w * (x * x - noise * dx * dx)
+        s[XY] += w * (x * y - noise * dx * dy)
+        s[YY] += w * (y * y - noise * dy * dy)
+        s[XZ] += w * (x * z - noise * dx * dz)
+        s[YZ] += w * (y * z - noise * dy * dz)
         s[ZZ] += w * z * z
         s[VZ] += w * variance_z
         for jy in range(max(0, iy - WINDOW), min(ny, iy + WINDOW + 1)):

@@ -30,7 +30,16 @@ class HeightFit:
     wall_points: int
     scale: float
     map_variance: float
-    new_ground: Array  # (N, 3) levelled points to be put into the map when the scan is accepted
+    new_ground: Array  # (N, 4) levelled block means to be put into the map when the scan is accepted
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneAbout:
+    """Plane through the means of cells about a place: its height there, how far the cells are off it, how many."""
+
+    z_m: float
+    rms_m: float
+    cells: int
 
 
 class HeightMap:
@@ -129,12 +138,31 @@ class HeightMap:
         slope = dx * dx * p[hk.SXX] + 2 * dx * dy * p[hk.SXY] + dy * dy * p[hk.SYY]
         return float(z), float(p[hk.ABOUT] / p[hk.WEIGHT] + slope)
 
-    def insert(self, points_map: Array, distance_m: Array, variance_z: float) -> None:
-        """Add ground points (N, 3); distance_m: (N,) horizontal, from the sensor."""
-        if len(points_map) == 0:
+    def plane_about(self, x_m: float, y_m: float, radius_m: float) -> PlaneAbout | None:
+        """Weighted least squares through the cells within radius_m; None where they do not surround the place."""
+        iy, ix = np.nonzero(self.sums[..., hk.W] >= hk.MIN_WEIGHT)
+        cells = self.sums[iy, ix]
+        weight = cells[:, hk.W]
+        x, y, z = cells[:, hk.X] / weight - x_m, cells[:, hk.Y] / weight - y_m, cells[:, hk.Z] / weight
+        near = np.hypot(x, y) <= radius_m
+        x, y, z, weight = x[near], y[near], z[near], weight[near]
+        quadrants = np.unique((x > 0.0).astype(np.int64) + 2 * (y > 0.0))
+        if len(quadrants) < 4:
+            return None
+        root = np.sqrt(weight)
+        design = np.column_stack([np.ones_like(x), x, y])
+        plane = np.linalg.lstsq(design * root[:, None], z * root, rcond=None)[0]
+        off = z - design @ plane
+        rms = float(np.sqrt(np.sum(weight * off**2) / np.sum(weight)))
+        return PlaneAbout(z_m=float(plane[0]), rms_m=rms, cells=len(x))
+
+    def insert(self, sight: Array, origin: Array, sigma_range_m: float, variance_z: float) -> None:
+        """Add ground points: sight (N, 4) from the body to them and of how many returns each is the mean, origin (3,) the
+        body's place; axes of `map`. sigma_range_m: of one return."""
+        if len(sight) == 0:
             return
-        self._cover(points_map[:, :2])
-        hk.insert_heights(self.sums, self.state, self.origin, self.cell_m, points_map, distance_m, variance_z)
+        self._cover(sight[:, :2] + origin[:2])
+        hk.insert_heights(self.sums, self.state, self.origin, self.cell_m, sight, origin, sigma_range_m**2, variance_z)
 
     def _cover(self, points: Array) -> None:
         low = np.floor((points.min(axis=0) - self.origin) / self.cell_m).astype(np.int64)

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.jit import kernel
 from companion.messages import Array
-from companion.odometry.jit import kernel
 
 WINDOW = 2
 # sums of a cell: weight, x, y, xx, xy, yy, pose variance in x, y, yaw

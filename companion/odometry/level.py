@@ -14,6 +14,7 @@ from companion.messages import Array, LevelledScan, LidarScan
 from companion.odometry import level_kernels as lk
 from companion.odometry.attitude import AttitudeHistory
 
+MIN_BENDS = 50  # of which the noise of returns is told
 BLOCK_RAD = math.radians(2.9)  # neighbours of a layer that are averaged: 4 of 512 columns
 
 
@@ -76,13 +77,24 @@ def wall_layer(levelled: LevelledScan, row: int, above_m: float) -> Array:
     return lk.layer_above(levelled.points_level, levelled.row, row, above_m)
 
 
+def range_noise_m(range_m: NDArray[np.float32]) -> float:
+    """Standard deviation of one return, from neighbours in a layer, (columns,), 0: no return. NaN: too few of them.
+
+    Second differences leave out what a surface does that is straight over three columns; their median leaves out edges.
+    """
+    bend, count = lk.median_bend(range_m)
+    return bend / (0.6745 * math.sqrt(6.0)) if count >= MIN_BENDS else math.nan
+
+
 def block_means(levelled: LevelledScan, above_row: int, columns: int, min_range_m: float) -> Array:
-    """(N, 3) means over blocks of neighbouring returns in each layer below `above_row`, levelled frame.
+    """Means over blocks of neighbouring returns in each layer below `above_row`: (N, 4) place in the levelled frame, and
+    how many returns each is the mean of.
 
     A lone return errs along its beam: its place and its height err together, and planes fitted to such points lean
-    along the beams. Averaging takes most of that away.
+    along the beams. Averaging takes most of that away. Where a layer's returns lie about min_range_m, taking those that
+    read longer would lower the ground by millimetres: so a block counts by the median of its whole sector.
     """
     size = max(1, round(columns * BLOCK_RAD / (2 * math.pi)))
     return lk.block_means(
-        levelled.points_level, levelled.range_m, levelled.row, levelled.column, above_row, size, min_range_m
+        levelled.points_level, levelled.range_m, levelled.row, levelled.column, above_row, size, min_range_m, columns
     )

@@ -10,10 +10,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.jit import kernel
 from companion.messages import Array
 from companion.odometry.attitude import interpolate_at
-from companion.odometry.jit import kernel
 
+SECTORS = 8  # of a turn: what is too near is told by a layer's median over one, not by the noise of a block
 BLOCK_SPAN_M = 0.6  # of range, about the block's median, beyond which a return is not the same surface
 
 
@@ -153,9 +154,12 @@ def block_means(
     above_row: int,
     size: int,
     min_range_m: float,
+    columns: int,
 ) -> Array:
-    """(M, 3) means of the returns of `size` neighbouring columns in each row below above_row; see level.block_means."""
-    out = np.empty((len(range_m) + 1, 3))
+    """(M, 4) means of the returns of `size` neighbouring columns in each row below above_row, and how many returns each is
+    the mean of; see level.block_means."""
+    middles = _sector_medians(range_m, row, column, columns)
+    out = np.empty((len(range_m) + 1, 4))
     rows = 0
     for i in range(len(range_m)):
         rows = max(rows, row[i] + 1)
@@ -169,13 +173,15 @@ def block_means(
         if k <= above_row:
             continue
         if column[i] // size != block[k]:
-            n += _mean_of_block(points, range_m, members[k], count[k], size, min_range_m, ranges, out[n])
+            if count[k] > 0 and middles[k, block[k] * size * SECTORS // columns] >= min_range_m:
+                n += _mean_of_block(points, range_m, members[k], count[k], size, ranges, out[n])
             count[k] = 0
             block[k] = column[i] // size
         members[k, count[k]] = i
         count[k] += 1
     for k in range(rows):  # the last blocks
-        n += _mean_of_block(points, range_m, members[k], count[k], size, min_range_m, ranges, out[n])
+        if count[k] > 0 and middles[k, block[k] * size * SECTORS // columns] >= min_range_m:
+            n += _mean_of_block(points, range_m, members[k], count[k], size, ranges, out[n])
     return out[:n].copy()
 
 
@@ -186,13 +192,10 @@ def _mean_of_block(
     members: NDArray[np.int64],
     count: int,
     size: int,
-    min_range_m: float,
     ranges: Array,
     out: Array,
 ) -> int:
-    """1 and the mean (3,) in `out` where enough of the block lie on one surface, else 0. ranges: (size,) scratch."""
-    if count == 0:
-        return 0
+    """1, and in `out` (4,) mean and returns, where enough of the block lie on one surface, else 0. ranges: (size,) scratch."""
     for j in range(count):
         ranges[j] = range_m[members[j]]
     middle = middle_of(ranges, count)
@@ -203,8 +206,42 @@ def _mean_of_block(
             for k in range(3):
                 out[k] += points[members[j], k]
             used += 1
-    if 2 * used < size or middle < min_range_m:
+    if 2 * used < size:
         return 0
     for k in range(3):
         out[k] /= used
+    out[3] = used
     return 1
+
+
+@kernel
+def _sector_medians(range_m: Array, row: NDArray[np.int64], column: NDArray[np.int64], columns: int) -> Array:
+    """(rows, SECTORS) median range of each row's returns in each sector of the turn; 0 where there are none."""
+    rows = 0
+    for i in range(len(range_m)):
+        rows = max(rows, row[i] + 1)
+    held = np.empty((rows, SECTORS, columns // SECTORS + 1))
+    count = np.zeros((rows, SECTORS), np.int64)
+    for i in range(len(range_m)):
+        k, sector = row[i], column[i] * SECTORS // columns
+        held[k, sector, count[k, sector]] = range_m[i]
+        count[k, sector] += 1
+    out = np.zeros((rows, SECTORS))
+    for k in range(rows):
+        for sector in range(SECTORS):
+            if count[k, sector] > 0:
+                out[k, sector] = np.median(held[k, sector, : count[k, sector]])
+    return out
+
+
+@kernel
+def median_bend(range_m: NDArray[np.float32]) -> tuple[float, int]:
+    """Median size of the second differences of a row's ranges (columns,), 0: no return; and of how many."""
+    bends = np.empty(len(range_m))
+    n = 0
+    for i in range(1, len(range_m) - 1):
+        before, middle, after = float(range_m[i - 1]), float(range_m[i]), float(range_m[i + 1])
+        if before > 0.0 and middle > 0.0 and after > 0.0:
+            bends[n] = abs(before - 2.0 * middle + after)
+            n += 1
+    return (float(np.median(bends[:n])), n) if n > 0 else (0.0, 0)

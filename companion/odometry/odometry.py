@@ -32,7 +32,7 @@ from companion.odometry.attitude import AttitudeBuffer, AttitudeHistory
 from companion.odometry.degeneracy import Judgement, judge, weak_direction
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
-from companion.odometry.level import Leveller, block_means, wall_layer
+from companion.odometry.level import Leveller, block_means, range_noise_m, wall_layer
 from companion.odometry.ranges import wall_ranges
 from companion.odometry.relocalise import relocalise
 from companion.odometry.standstill import Standstill
@@ -45,6 +45,7 @@ KEYFRAME_HEIGHT_LOW_M = 0.2  # below LOW_M, where nothing yet tells walls from t
 LOW_M = 1.5
 MAX_PENDING = 100  # scans kept until the next keyframe
 STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
+NOISE_RATE = 0.05  # of a scan in what is known of the noise of returns
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
 WAIT_FOR_FIRST_SCANS = 5
@@ -72,7 +73,7 @@ class ScanResult:
 
 
 class _Pending(NamedTuple):
-    """A registered scan that waits for the next keyframe: layer (N, 2), ground (M, 3), levelled; pose x, y, yaw, z."""
+    """A registered scan that waits for the next keyframe: layer (N, 2), ground (M, 4), levelled; pose x, y, yaw, z."""
 
     layer: Array
     ground: Array
@@ -99,6 +100,7 @@ class Odometry:
         self._standing_scans = 0
         self._pending: list[_Pending] = []
         self._sigma_range_m = 0.1
+        self._return_sigma_m = math.nan  # of single returns: the registration's also holds what walls are rough by
         self._accepted = 0
         self._usual_share = 0.0  # of the layer's points that found a wall, lately
         self._is_weak, self._is_lost = False, False  # along an axis: not held by walls; nor known well enough to map
@@ -160,6 +162,7 @@ class Odometry:
         row = scan.geometry.horizontal_row
         layer = wall_layer(levelled, row, self.height.floor_below_m(float(vertical.x[0])))
         near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
+        self._track_return_noise(scan)
         lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None
         if old is None:
@@ -327,6 +330,13 @@ class Odometry:
         rate = max(0.01, 0.3 / (1 + self._accepted / 5))
         self._sigma_range_m = min(max(self._sigma_range_m * scale**rate, 0.01), 0.5)
 
+    def _track_return_noise(self, scan: LidarScan) -> None:
+        now = range_noise_m(scan.range_m[scan.geometry.horizontal_row])
+        if math.isnan(self._return_sigma_m):
+            self._return_sigma_m = now if math.isfinite(now) else self._sigma_range_m
+        elif math.isfinite(now):
+            self._return_sigma_m += NOISE_RATE * (now - self._return_sigma_m)
+
     def _stand(
         self,
         history: AttitudeHistory,
@@ -349,6 +359,7 @@ class Odometry:
             self._standing_scans += 1
             return kalman.start(planar.t_ns), kalman.start_vertical(vertical.t_ns)
         self._is_released = True
+        self.height.leave_ground()
         self._base_variance = noise / max(1, self._standing_scans)
         del self._pending[-STANDING_DELAY:]
         still = self._standstill
@@ -403,11 +414,10 @@ class Odometry:
         for waiting in ready:
             r = rotation2(float(waiting.pose[2])).T
             self.walls.insert(waiting.layer @ r + waiting.pose[:2], waiting.z_m, waiting.variance[:3])
-            ground = waiting.ground.copy()
-            ground[:, :2] = waiting.ground[:, :2] @ r + waiting.pose[:2]
-            ground[:, 2] += waiting.z_m
-            distance = np.hypot(waiting.ground[:, 0], waiting.ground[:, 1])
-            self.height.ground.insert(ground, distance, float(waiting.variance[3]))
+            sight = waiting.ground.copy()
+            sight[:, :2] = waiting.ground[:, :2] @ r
+            origin = np.array([*waiting.pose[:2], waiting.z_m])
+            self.height.ground.insert(sight, origin, self._return_sigma_m, float(waiting.variance[3]))
         self._keyframe_t_ns, self._keyframe_z_m = t_ns, z_m
 
 

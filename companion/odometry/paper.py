@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from companion.config import CompanionConfig
 from companion.geometry import matrix_from_quat, quat_from_rpy, rotation2
+from companion.jit import kernel
 from companion.messages import Array, LidarScan
-from companion.odometry.jit import kernel
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.jit import kernel
 from companion.messages import Array, LidarScan, WallRanges
-from companion.odometry.jit import kernel
 from companion.odometry.level import AllReturns
 from companion.odometry.level_kernels import middle_of
 
