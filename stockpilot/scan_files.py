@@ -306,7 +306,7 @@ def _cloud_points(cloud: Any) -> Array:
 # ---- CARMEN ----------------------------------------------------------------------------------------------------------
 
 
-def _text_lines(path: Path, dropped: dict[str, int] | None = None) -> Iterator[str]:
+def _text_lines(path: Path, dropped: dict[str, int]) -> Iterator[str]:
     """Up to where a packed file is cut or broken, which dropped is told."""
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
@@ -314,13 +314,12 @@ def _text_lines(path: Path, dropped: dict[str, int] | None = None) -> Iterator[s
         try:
             yield from file
         except (EOFError, zlib.error, gzip.BadGzipFile):
-            if dropped is not None:
-                dropped["what follows: the file is cut or broken"] = 1
+            dropped["what follows: the file is cut or broken"] = 1
 
 
-def carmen_lines(path: Path) -> Iterator[tuple[str, int, int]]:
+def carmen_lines(path: Path, dropped: dict[str, int]) -> Iterator[tuple[str, int, int]]:
     """(message name, time, length) of each line that carries a time."""
-    for line in _text_lines(path):
+    for line in _text_lines(path, dropped):
         words = line.split()
         if len(words) > 3 and not line.startswith(("#", "PARAM")):
             try:
