@@ -232,5 +232,5 @@ def _read_bag(found: Contents) -> None:
 
 
 def _read_carmen(found: Contents) -> None:
-    for word, t_ns, size in carmen_lines(found.path):
+    for word, t_ns, size in carmen_lines(found.path, found.drops):
         found.stream(word).add(t_ns, size)

@@ -15,8 +15,9 @@ import typer
 
 from companion.errors import FileFormatError
 from companion.messages import Array, PointMap
+from companion.odometry.loop_closure import LoopCloser
+from companion.odometry.planar import PlanarMatcher
 from companion.recording.tum import seconds
-from stockpilot.planar import PlanarMatcher
 from stockpilot.scan_files import FileScan, ScanFile, open_scans
 
 MAP_EVERY_M = 0.3  # a scan goes into the map when the scanner has moved this far or turned this much
@@ -26,13 +27,18 @@ MAP_CELL_M = 0.05
 
 @dataclass(slots=True)
 class Track:
-    """What odometry made of a recording: a pose (x, y, yaw) at each scan's own time."""
+    """What odometry made of a recording: a pose (x, y, yaw) at each scan's own time.
+
+    poses: in map, with loops closed, or in odom where that was not asked for. map_scans: index and points of the scans
+    that make the map.
+    """
 
     t_ns: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     converged: list[bool] = field(default_factory=list)
-    map_points: list[Array] = field(default_factory=list)
+    map_scans: list[tuple[int, Array]] = field(default_factory=list)
     out_of_order: int = 0
+    loops: int = 0
     wall_time_s: float = 0.0
 
     def tum(self) -> Iterator[str]:
@@ -42,9 +48,9 @@ class Track:
             yield f"{seconds(t_ns)} {float(x)!r} {float(y)!r} 0.0 0.0 0.0 {math.sin(half)!r} {math.cos(half)!r}\n"
 
 
-def track(scans: Iterator[FileScan], *, with_map: bool = False) -> Track:
+def track(scans: Iterator[FileScan], *, with_map: bool = False, with_loops: bool = True) -> Track:
     """Run the odometry over scans in their order; one whose time does not follow the last one's is left out."""
-    matcher = PlanarMatcher()
+    matcher, closer = PlanarMatcher(), LoopCloser()
     found = Track()
     last_map: Array | None = None
     began = time.perf_counter()
@@ -53,13 +59,16 @@ def track(scans: Iterator[FileScan], *, with_map: bool = False) -> Track:
             found.out_of_order += 1
             continue
         match = matcher.match(scan.points, scan.t_ns)
-        pose = match.pose
+        if with_loops:
+            closer.add(scan.points, match.pose, match.information, converged=match.converged)
         found.t_ns.append(scan.t_ns)
-        found.poses.append(pose)
+        found.poses.append(match.pose)
         found.converged.append(match.converged)
-        if with_map and match.converged and _has_moved(last_map, pose):
-            last_map = pose
-            found.map_points.append(_placed(scan.points_3d, pose))
+        if with_map and match.converged and _has_moved(last_map, match.pose):
+            last_map = match.pose
+            found.map_scans.append((len(found.poses) - 1, scan.points_3d))
+    if with_loops:
+        found.poses, found.loops = list(closer.poses()), closer.loops
     found.wall_time_s = time.perf_counter() - began
     return found
 
@@ -82,7 +91,8 @@ def write_map(path: Path, found: Track) -> int:
     """One point for each 5 cm, as PLY or LAS/LAZ by the name's end; returns how many."""
     from companion.mapping.export import save_point_map
 
-    every = np.concatenate(found.map_points) if found.map_points else np.zeros((0, 3))
+    placed = [_placed(points, found.poses[index]) for index, points in found.map_scans]
+    every = np.concatenate(placed) if placed else np.zeros((0, 3))
     _, first = np.unique(np.floor(every / MAP_CELL_M).astype(np.int64), axis=0, return_index=True)
     kept = every[np.sort(first)]
     flown = np.column_stack([np.array([p[:2] for p in found.poses]), np.zeros(len(found.poses))])
@@ -106,6 +116,9 @@ def odometry_command(
         Path | None, typer.Option(help="an Ouster sensor's metadata JSON; default: the one beside the pcap")
     ] = None,
     topic: Annotated[str | None, typer.Option(help="which LaserScan or PointCloud2, if there are several")] = None,
+    loops: Annotated[
+        bool, typer.Option(help="close loops where a place is seen again; without: odometry alone, which drifts")
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="print the result as JSON on stdout")] = False,
 ) -> None:
     """Run the odometry on a recording of another robot: the kind is recognised by content, times are those of the scans.
@@ -115,7 +128,7 @@ def odometry_command(
     Exit codes: 0 all well, 1 fewer than half the scans could be placed, 2 not a recording with scans.
     """
     opened = open_scans(file, metadata=metadata, topic=topic)
-    found = track(opened.scans, with_map=map_out is not None)
+    found = track(opened.scans, with_map=map_out is not None, with_loops=loops)
     if not found.t_ns:
         raise FileFormatError(f"{file}: no whole scan in it")
     said = summary(file, opened, found)
@@ -139,6 +152,7 @@ def summary(file: Path, opened: ScanFile, found: Track) -> dict[str, Any]:
         "sensor": opened.sensor,
         "scans": len(found.t_ns),
         "placed_ratio": float(np.mean(found.converged)),
+        "loops": found.loops,
         "out_of_order": found.out_of_order,
         "dropped": {k: n for k, n in opened.dropped.items() if n},
         "duration_s": duration_s,
@@ -158,6 +172,8 @@ def describe(said: dict[str, Any]) -> str:
         f"in {said['wall_time_s']:.1f} s ({said['real_time_factor']:.0f} times real time)",
         f"path {said['path_length_m']:.2f} m, ends at x {x:.3f} m, y {y:.3f} m, yaw {math.degrees(yaw):.2f} deg",
     ]
+    if said["loops"]:
+        lines.append(f"{said['loops']} loop closures")
     if said["out_of_order"]:
         lines.append(f"{said['out_of_order']} scans left out: their time is not after the one before")
     lines += [f"dropped {n}: {why}" for why, n in said["dropped"].items()]

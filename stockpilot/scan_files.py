@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import gzip
 import math
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,8 @@ def open_scans(path: Path, *, metadata: Path | None = None, topic: str | None = 
     if kind in (FileKind.ROS1, FileKind.ROS2):
         return _open_ros(kind, file, topic)
     if kind is FileKind.CARMEN:
-        return ScanFile(kind=kind, sensor="CARMEN laser", scans=_carmen_scans(file), dropped={})
+        dropped: dict[str, int] = {}
+        return ScanFile(kind=kind, sensor="CARMEN laser", scans=_carmen_scans(file, dropped), dropped=dropped)
     raise FileFormatError(f"{file}: a {kind.value} holds no scans; expected a capture, a ROS bag, MCAP or a CARMEN log")
 
 
@@ -225,17 +227,24 @@ def _ros_name(name: str) -> str:
 # ---- ROS bags --------------------------------------------------------------------------------------------------------
 
 
-def open_bag(path: Path) -> AbstractContextManager[Any]:
-    """A ROS 1 or 2 bag by rosbags' AnyReader. Raises: FileFormatError: it cannot be opened."""
+@contextmanager
+def open_bag(path: Path) -> Iterator[Any]:
+    """A ROS 1 or 2 bag by rosbags' AnyReader. Raises: FileFormatError: it cannot be opened, or breaks off on the way.
+
+    A bag that is cut or broken makes rosbags fail in many ways, not all of them its own errors: all mean the file.
+    """
     highlevel = _import("rosbags.highlevel")
     typesys = _import("rosbags.typesys")
     try:
-        reader: AbstractContextManager[Any] = highlevel.AnyReader(
-            [path], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-        )
-    except highlevel.AnyReaderError as error:
-        raise FileFormatError(f"{path}: the bag cannot be opened: {error}") from None
-    return reader
+        with highlevel.AnyReader([path], default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)) as bag:
+            yield bag
+    except (FileFormatError, OSError):
+        raise
+    except Exception as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise FileFormatError(
+            f"{path}: the bag cannot be read: {said}; if it was cut, `rosbag reindex` or `ros2 bag reindex` may mend it"
+        ) from None
 
 
 def _open_ros(kind: FileKind, path: Path, topic: str | None) -> ScanFile:
@@ -297,16 +306,20 @@ def _cloud_points(cloud: Any) -> Array:
 # ---- CARMEN ----------------------------------------------------------------------------------------------------------
 
 
-def _text_lines(path: Path) -> Iterator[str]:
+def _text_lines(path: Path, dropped: dict[str, int]) -> Iterator[str]:
+    """Up to where a packed file is cut or broken, which dropped is told."""
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
     with gzip.open(path, "rt", errors="replace") if packed else path.open(errors="replace") as file:
-        yield from file
+        try:
+            yield from file
+        except (EOFError, zlib.error, gzip.BadGzipFile):
+            dropped["what follows: the file is cut or broken"] = 1
 
 
-def carmen_lines(path: Path) -> Iterator[tuple[str, int, int]]:
+def carmen_lines(path: Path, dropped: dict[str, int]) -> Iterator[tuple[str, int, int]]:
     """(message name, time, length) of each line that carries a time."""
-    for line in _text_lines(path):
+    for line in _text_lines(path, dropped):
         words = line.split()
         if len(words) > 3 and not line.startswith(("#", "PARAM")):
             try:
@@ -315,10 +328,10 @@ def carmen_lines(path: Path) -> Iterator[tuple[str, int, int]]:
                 continue
 
 
-def _carmen_scans(path: Path) -> Iterator[FileScan]:
+def _carmen_scans(path: Path, dropped: dict[str, int]) -> Iterator[FileScan]:
     """FLASER and ROBOTLASER1 lines (CARMEN's log format); time: when the laser was read, not when it was logged."""
     found = False
-    for line in _text_lines(path):
+    for line in _text_lines(path, dropped):
         if line.startswith(("FLASER ", "ROBOTLASER1 ")):
             scan = _carmen_scan(line.split())
             if scan is not None:

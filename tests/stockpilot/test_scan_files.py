@@ -231,3 +231,28 @@ def test_bag_without_scans_is_told(tmp_path: Path) -> None:
         bag.add_connection("/chatter", "std_msgs/msg/String", typestore=STORE1)
     with pytest.raises(FileFormatError, match="LaserScan"):
         open_scans(path)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.95])
+def test_cut_bag_is_told_and_never_a_traceback(tmp_path: Path, share: float) -> None:
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    with Writer1(whole) as bag:
+        connection = bag.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=STORE1)
+        for n in range(50):
+            bag.write(connection, n, STORE1.serialize_ros1(laser_scan(STORE1, n), "sensor_msgs/msg/LaserScan"))
+    data = whole.read_bytes()
+    cut.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(FileFormatError, match="cut"):
+        scans_of(cut)
+
+
+def test_packed_log_that_is_cut_gives_what_came_before_and_is_told(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    lines = [f"FLASER 4 {' '.join(map(str, rng.uniform(1, 9, 4)))} 0 0 0 0 0 0 {n}.5 host {n}.5" for n in range(500)]
+    path = tmp_path / "log"
+    path.write_bytes(gzip.compress("\n".join(lines).encode())[:-9000])
+    opened = open_scans(path)
+    scans = list(opened.scans)
+    assert 100 < len(scans) < 500
+    assert [s.t_ns for s in scans] == [n * 10**9 + 500_000_000 for n in range(len(scans))]
+    assert "cut" in next(iter(opened.dropped))
