@@ -52,7 +52,7 @@ class HeightTracker:
         self.map_variance = 0.0
         self._sensor_up_m = sensor_up_m
         self._rangefinder: deque[RangefinderSample] = deque(maxlen=64)
-        self._rest: list[float] = []
+        self._rest_m, self._rests = 0.0, 0  # mean reading while standing, and of how many
         self._floor_m: float | None = None  # by the LiDAR, once it has left the ground
         self._tilt = np.zeros(2)
         self._tilt_p = np.eye(2) * TILT_SIGMA_RAD**2
@@ -71,7 +71,7 @@ class HeightTracker:
         """
         if self._floor_m is not None:
             return self._floor_m
-        return -float(np.mean(self._rest)) if len(self._rest) >= 5 else None
+        return -self._rest_m if self._rests >= 5 else None
 
     def leave_ground(self) -> None:
         """Standing has ended: what the LiDAR saw of the floor until now is the best that will be known of it there."""
@@ -88,8 +88,9 @@ class HeightTracker:
         """Not finite, or not positive: nothing below within range."""
         if not (math.isfinite(sample.distance_m) and sample.distance_m > 0.0):
             return
-        if self.is_standing and len(self._rest) < 400:
-            self._rest.append(sample.distance_m)
+        if self.is_standing:
+            self._rests += 1
+            self._rest_m += (sample.distance_m - self._rest_m) / self._rests
         self._rangefinder.append(sample)
 
     def fit(
