@@ -39,11 +39,12 @@ def insert_heights(
     cell_m: float,
     sight: Array,
     origin: Array,
+    sensor: Array,
     variance_range: float,
     variance_z: float,
 ) -> None:
     """Add ground points, sight (N, 4: place, returns) from origin (3,); far ones count less, as tilt errors grow with
-    distance. variance_range: of one return.
+    distance. sensor: (3,) where the beams come from, from origin too. variance_range: of one return.
 
     A point errs along its beam, so its place and its height err together, and a plane through such points leans along the
     beams. What the range's variance puts into the moments is known, and is taken out of them again.
@@ -56,18 +57,19 @@ def insert_heights(
         if ix < 0 or iy < 0 or ix >= nx or iy >= ny:
             continue
         far2 = dx * dx + dy * dy
-        noise = variance_range / (sight[i, 3] * max(far2 + dz * dz, 1e-6))
+        bx, by, bz = dx - sensor[0], dy - sensor[1], dz - sensor[2]
+        noise = variance_range / (sight[i, 3] * max(bx * bx + by * by + bz * bz, 1e-6))
         w = 1.0 / (1.0 + far2 * (TILT_FAR_RAD / 0.06) ** 2)
         s = sums[iy, ix]
         s[W] += w
         s[X] += w * x
         s[Y] += w * y
         s[Z] += w * z
-        s[XX] += w * (x * x - noise * dx * dx)
-        s[XY] += w * (x * y - noise * dx * dy)
-        s[YY] += w * (y * y - noise * dy * dy)
-        s[XZ] += w * (x * z - noise * dx * dz)
-        s[YZ] += w * (y * z - noise * dy * dz)
+        s[XX] += w * (x * x - noise * bx * bx)
+        s[XY] += w * (x * y - noise * bx * by)
+        s[YY] += w * (y * y - noise * by * by)
+        s[XZ] += w * (x * z - noise * bx * bz)
+        s[YZ] += w * (y * z - noise * by * bz)
         s[ZZ] += w * z * z
         s[VZ] += w * variance_z
         for jy in range(max(0, iy - WINDOW), min(ny, iy + WINDOW + 1)):

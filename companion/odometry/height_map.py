@@ -156,13 +156,15 @@ class HeightMap:
         rms = float(np.sqrt(np.sum(weight * off**2) / np.sum(weight)))
         return PlaneAbout(z_m=float(plane[0]), rms_m=rms, cells=len(x))
 
-    def insert(self, sight: Array, origin: Array, sigma_range_m: float, variance_z: float) -> None:
+    def insert(self, sight: Array, origin: Array, sensor: Array, sigma_range_m: float, variance_z: float) -> None:
         """Add ground points: sight (N, 4) from the body to them and of how many returns each is the mean, origin (3,) the
-        body's place; axes of `map`. sigma_range_m: of one return."""
+        body's place, sensor (3,) from there to where the beams come from; axes of `map`. sigma_range_m: of one return."""
         if len(sight) == 0:
             return
         self._cover(sight[:, :2] + origin[:2])
-        hk.insert_heights(self.sums, self.state, self.origin, self.cell_m, sight, origin, sigma_range_m**2, variance_z)
+        hk.insert_heights(
+            self.sums, self.state, self.origin, self.cell_m, sight, origin, sensor, sigma_range_m**2, variance_z
+        )
 
     def _cover(self, points: Array) -> None:
         low = np.floor((points.min(axis=0) - self.origin) / self.cell_m).astype(np.int64)

@@ -73,10 +73,12 @@ class ScanResult:
 
 
 class _Pending(NamedTuple):
-    """A registered scan that waits for the next keyframe: layer (N, 2), ground (M, 4), levelled; pose x, y, yaw, z."""
+    """A registered scan that waits for the next keyframe: layer (N, 2), ground (M, 4), sensor (3,), levelled; pose x, y,
+    yaw, z."""
 
     layer: Array
     ground: Array
+    sensor: Array
     pose: Array
     z_m: float
     variance: Array  # (4,) x, y, yaw, z
@@ -180,7 +182,8 @@ class Odometry:
             snapshot = self._after(old, scan, planar, vertical, registration, judgement, reset)
         variance = np.array([planar.p[0, 0], planar.p[1, 1], planar.p[6, 6], vertical.p[0, 0]]) + snapshot.map_variance
         if judgement is None or (judgement.is_accepted and not self._is_lost):
-            self._pending.append(_Pending(layer, ground, planar.x[kalman.POSE], float(vertical.x[0]), variance))
+            sensor = levelled.origin_level_m
+            self._pending.append(_Pending(layer, ground, sensor, planar.x[kalman.POSE], float(vertical.x[0]), variance))
             del self._pending[:-MAX_PENDING]
         if snapshot.is_keyframe:
             self._close_keyframe(scan.t_ns, float(vertical.x[0]), is_first=old is None)
@@ -417,7 +420,8 @@ class Odometry:
             sight = waiting.ground.copy()
             sight[:, :2] = waiting.ground[:, :2] @ r
             origin = np.array([*waiting.pose[:2], waiting.z_m])
-            self.height.ground.insert(sight, origin, self._return_sigma_m, float(waiting.variance[3]))
+            sensor = np.array([*(waiting.sensor[:2] @ r), waiting.sensor[2]])
+            self.height.ground.insert(sight, origin, sensor, self._return_sigma_m, float(waiting.variance[3]))
         self._keyframe_t_ns, self._keyframe_z_m = t_ns, z_m
 
 
