@@ -3,7 +3,8 @@
     python -m benchmarks.scans2d [NAME ...] [--no-loops] [--json]
 
 Names: aces.orig.bag, intel.orig.bag, aces-corrected.log.gz, intel-corrected.log.gz (default: all), read in place from
-../shared/data/scans2d. The metric is Kuemmerle et al.'s (Autonomous Robots 27, 2009): over all relations between two
+../shared/data/scans2d (or STOCKPILOT_SHARED_DATA).
+The metric is Kuemmerle et al.'s (Autonomous Robots 27, 2009): over all relations between two
 scans, mean and standard deviation of the translational and rotational part of inverse(true relation) * estimated one.
 The scans alone are used, not the wheel odometry beside them. A relation without a scan at both of its times (the
 corrected logs keep a scan in fifteen) is left out and counted.
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -23,7 +25,8 @@ from companion.odometry.pose_graph import relative
 from stockpilot.odometry_cli import track
 from stockpilot.scan_files import open_scans
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "scans2d"
+SHARED = os.environ.get("STOCKPILOT_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(SHARED) / "scans2d"
 NAMES = ("aces.orig.bag", "aces-corrected.log.gz", "intel.orig.bag", "intel-corrected.log.gz")
 SAME_TIME_S = 0.01
 
