@@ -22,7 +22,7 @@ SIGMA_M = 0.1  # a point this far from the map's counts exp(-1/2)
 REACH = 2  # cells about a point that it lights
 BLOCK = 8  # cells of a coarse step
 MARGIN_CELLS = 32
-FAR_M = 10.0  # a step of the turn moves a point this far away by a cell
+FAR_M = 20.0  # a step of the turn moves a point this far away by a cell
 FAR_WEIGHT = 0.15  # what the corner of the window costs against its middle: of equal fits, the nearer one
 
 

@@ -115,4 +115,5 @@ def _solved(count: int, since: Nodes, until: Nodes, error: Array, a: Array, b: A
         shape=(3 * count, 3 * count),
     )
     step: Array = splu(system).solve(-right.ravel()).reshape(count, 3)
+    step[0] = 0.0  # to the last bit
     return step
