@@ -32,6 +32,7 @@ PARTS = {
     "range": "offset of the sensor's range",
     "floor": "the floor under the pile",
     "walls": "where the pile meets the walls",
+    "contact": "how high it meets them",
     "interpolated": "interpolated gaps",
     "unseen": "floor not seen",
     "obstacles": "obstacles standing in the pile",

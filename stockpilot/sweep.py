@@ -130,6 +130,9 @@ def sweep_command(
     docs: Annotated[
         Path | None, typer.Option(help="fill this document's block of the sweep, e.g. docs/results.md")
     ] = None,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="fly so many of the missing ones now, spread evenly over the sweep")
+    ] = None,
     list_only: Annotated[bool, typer.Option("--list", help="name the flights, fly none")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON on stdout")] = False,
 ) -> None:
@@ -149,7 +152,7 @@ def sweep_command(
     folder.mkdir(parents=True, exist_ok=True)
     done = read_results(folder, runs)
     console = Console(stderr=True)
-    missing = [run for run in runs if run.name not in done]
+    missing = spread([run for run in runs if run.name not in done], limit)
     if done:
         console.print(f"{len(done)} of {len(runs)} flights are there already")
     failed: dict[str, str] = {}
@@ -175,6 +178,13 @@ def sweep_command(
             typer.echo(f"{key:28} {value}")
     if failed or len(results) < len(runs):
         raise typer.Exit(1)
+
+
+def spread(runs: Sequence[SweepRun], limit: int | None) -> list[SweepRun]:
+    """At most `limit` of them, evenly spaced, so that a part of a sweep speaks for all of it."""
+    if limit is None or limit >= len(runs):
+        return list(runs)
+    return [runs[n * len(runs) // limit] for n in range(limit)]
 
 
 def read_results(folder: Path, runs: Iterable[SweepRun]) -> dict[str, dict[str, Any]]:

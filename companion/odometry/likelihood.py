@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from companion.geometry import rotation2, wrap_angle
+from companion.jit import kernel
 from companion.messages import Array
-from companion.odometry.jit import kernel
 
 CELL_M = 0.1
 SIGMA_M = 0.1  # a point this far from the map's counts exp(-1/2)

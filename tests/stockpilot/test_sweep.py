@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from companion.errors import ConfigError
-from stockpilot.sweep import SweepRun, load_sweep, read_results
+from stockpilot.sweep import SweepRun, load_sweep, read_results, spread
 from stockpilot.sweep_report import (
     fill_document,
     flat_row,
@@ -58,6 +58,14 @@ def test_bad_sweep_is_refused_before_anything_flies(tmp_path: Path, text: str, t
     with pytest.raises(ConfigError) as error:
         load_sweep(path)
     assert told in str(error.value)
+
+
+def test_a_part_of_a_sweep_is_spread_over_all_of_it() -> None:
+    _, runs = load_sweep(MISSIONS / "sweeps" / "interval.yaml")
+    part = spread(runs, 20)
+    assert len({run.name for run in part}) == 20
+    assert {dict(run.parameters)["mission"] for run in part} == {dict(run.parameters)["mission"] for run in runs}
+    assert spread(runs, None) == spread(runs, 1000) == runs
 
 
 def result(
