@@ -27,6 +27,7 @@ from companion.recording.tum import tum_line
 from stockpilot.mission import parse_setting
 
 EXIT_DIFFERENT = 1
+BESIDE = ("keyframes", "volume_m3", "volume_interval_m3", "seen_ratio")  # of the run's own report, set beside a new one
 
 
 @dataclass(slots=True)
@@ -122,6 +123,8 @@ def replay_command(
     left = left_behind(folder) if diff else {}
     volume = again.flight.measure() if report or out is not None or "volume_m3" in left else None
     said = summary(again, volume)
+    if report:
+        said["recorded"] = told_by_run(folder)
     differences: list[TopicDifference] = []
     if diff:
         differences = [*compare(again.recording.topics, again.replay), *compare_results(left, again, volume)]
@@ -145,6 +148,15 @@ def left_behind(folder: Path) -> dict[str, Any]:
         if isinstance(report.get("volume_m3"), float):
             found["volume_m3"] = report["volume_m3"]
     return found
+
+
+def told_by_run(folder: Path) -> dict[str, Any]:
+    """What the run's own report.json says of the figures that a replay tells anew; empty without one."""
+    try:
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return {key: report[key] for key in BESIDE if isinstance(report, dict) and report.get(key) is not None}
 
 
 def compare_results(left: dict[str, Any], again: Replayed, volume: VolumeReport | None) -> list[TopicDifference]:
@@ -210,6 +222,20 @@ def write_results(folder: Path, again: Replayed, said: dict[str, Any]) -> None:
     (folder / "report.json").write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
 
 
+def _beside(recorded: dict[str, Any]) -> str:
+    parts = []
+    if "volume_m3" in recorded:
+        parts.append(f"volume {recorded['volume_m3']:.2f} m3")
+    if "volume_interval_m3" in recorded:
+        low, high = recorded["volume_interval_m3"]
+        parts.append(f"interval {low:.2f} to {high:.2f}")
+    if "seen_ratio" in recorded:
+        parts.append(f"seen {recorded['seen_ratio']:.1%}")
+    if "keyframes" in recorded:
+        parts.append(f"keyframes {recorded['keyframes']}")
+    return ", ".join(parts)
+
+
 def describe(said: dict[str, Any]) -> str:
     """The same for people."""
     lines = [
@@ -224,6 +250,8 @@ def describe(said: dict[str, Any]) -> str:
             f"volume {said['volume_m3']:.2f} m3, interval {low:.2f} to {high:.2f}, seen {said['seen_ratio']:.1%}"
         )
         lines += [f"  {w}" for w in said["warnings"]]
+    if said.get("recorded"):
+        lines.append(f"the run itself told {_beside(said['recorded'])}")
     if not said["is_whole"]:
         lines.append("the recording is not whole: stockpilot recover rebuilds it")
     for d in said.get("differences", []):

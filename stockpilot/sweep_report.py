@@ -208,6 +208,14 @@ def _groups(results: Sequence[Result]) -> list[tuple[str, list[Result]]]:
     return list(groups.items())
 
 
+def _ticks(results: Sequence[Result], groups: Sequence[tuple[str, list[Result]]]) -> tuple[list[str], str]:
+    """Under each box the values of what varies in the sweep, each in a line of its own; and what those are."""
+    names = list(results[0]["parameters"])
+    varied = [name for name in names if len({str(r["parameters"].get(name)) for r in results}) > 1] or names[:1]
+    labels = ["\n".join(str(group[0]["parameters"].get(name)) for name in varied) for _, group in groups]
+    return labels, ", ".join(name.split(".")[-1] for name in varied)
+
+
 def _box_plots(results: Sequence[Result]) -> bytes:
     from matplotlib.figure import Figure
 
@@ -216,7 +224,7 @@ def _box_plots(results: Sequence[Result]) -> bytes:
         ("e_v_percent", "|e_v|: volume error, %"), ("keyframes", "scans recorded"),
     )  # fmt: skip
     groups = _groups(results)
-    labels = [label.replace("cement_store, ", "").replace(", ", "\n") for label, _ in groups]
+    labels, varied = _ticks(results, groups)
     figure = Figure(figsize=(max(9.0, 0.75 * len(groups) + 4), 12), layout="constrained")
     axes = figure.subplots(len(panels), 1, sharex=True)
     for axis, (key, title) in zip(axes, panels, strict=True):
@@ -240,8 +248,9 @@ def _box_plots(results: Sequence[Result]) -> bytes:
             axis.set_yscale("log")
         axis.grid(axis="y", alpha=0.3)
     axes[0].legend(loc="upper right")
-    axes[-1].set_xticks(range(len(groups)), labels, fontsize=7)
-    figure.suptitle("Figure 6 of the paper, both pipelines on the same flights (five starts a box)")
+    axes[-1].set_xticks(range(len(groups)), labels, fontsize=9)
+    axes[-1].set_xlabel(f"by {varied}")
+    figure.suptitle(f"Both pipelines on the same {len(results)} flights, as figure 6 of the paper")
     return _png(figure)
 
 

@@ -13,13 +13,13 @@ import struct
 from dataclasses import dataclass, replace
 
 import numpy as np
+from fastcrc import crc64
 from numpy.typing import NDArray
 from ouster.sdk import core
 
 from companion.config import LidarConfig
 from companion.errors import FileFormatError
 from companion.jit import kernel
-from companion.lidar.crc64 import TABLES, crc64
 from companion.lidar.sensor_clock import SensorClock
 from companion.messages import LidarGeometry, LidarScan
 
@@ -148,8 +148,7 @@ class OusterDecoder:
         self._is_open = False
         self._is_restarted = False
         self._last: LidarScan | None = None
-        self._is_sound(empty.tobytes(), empty)  # compiles what decodes now, and not while packets wait
-        self._decode(0)
+        self._decode(0)  # compiles what decodes now, and not while packets wait
 
     @classmethod
     def from_config(cls, cfg: LidarConfig) -> OusterDecoder:
@@ -165,12 +164,11 @@ class OusterDecoder:
         self.packets += 1
         if len(packet) != self._packet_size:
             return self._drop("size")
-        array = np.frombuffer(packet, dtype=np.uint8)
-        kind, frame_id, init_id, serial = self._read_header(packet, array)
+        kind, frame_id, init_id, serial = self._read_header(packet)
         stamp, measurement = _COLUMN_START.unpack_from(packet, self._header_size)
         if kind != PACKET_TYPE_LIDAR or measurement >= self._width:
             return self._drop("header")
-        if self._has_checksum and not self._is_sound(packet, array):
+        if self._has_checksum and not self._is_sound(packet):
             return self._drop("checksum")
         if not self._is_ours(init_id, serial, source, t_ns):
             return self._drop("foreign")
@@ -182,19 +180,19 @@ class OusterDecoder:
         self.dropped[reason] += 1
         return []
 
-    def _read_header(self, packet: bytes, array: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    def _read_header(self, packet: bytes) -> tuple[int, int, int, int]:
         """(packet type, frame id, init id, serial number)."""
         if self._is_standard:
             kind, frame_id, identity = _STANDARD_HEADER.unpack_from(packet)
             return kind, frame_id, identity & 0xFFFFFF, identity >> 24
-        fmt = self._format
+        fmt, array = self._format, np.frombuffer(packet, dtype=np.uint8)
         return PACKET_TYPE_LIDAR, int(fmt.frame_id(array)), int(fmt.init_id(array)), int(fmt.prod_sn(array))
 
-    def _is_sound(self, packet: bytes, array: NDArray[np.uint8]) -> bool:
+    def _is_sound(self, packet: bytes) -> bool:
         """Whether the checksum in the last eight bytes is that of all before it."""
         end = len(packet) - CHECKSUM_SIZE
         (stored,) = _CHECKSUM.unpack_from(packet, end)
-        return stored in NO_CHECKSUM or stored == crc64(array, end, TABLES)
+        return stored in NO_CHECKSUM or stored == crc64.xz(packet[:end])
 
     def _is_ours(self, init_id: int, serial: int, source: tuple[str, int] | None, t_ns: int) -> bool:
         if self._serial and serial != self._serial and self._has_identity:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from companion.messages import Array
 from companion.odometry import height_kernels as hk
-from companion.odometry.wall_map import MARGIN_CELLS, MAX_CELLS, WallMap
+from companion.odometry.grid_growth import growth
+from companion.odometry.wall_map import WallMap
 
 MAX_POINTS = 3072  # of a scan; more are thinned evenly
 BEND_SIGMA_RAD = 0.0017  # slope that the ground's map may have gained while it was built
@@ -167,17 +168,10 @@ class HeightMap:
         )
 
     def _cover(self, points: Array) -> None:
-        low = np.floor((points.min(axis=0) - self.origin) / self.cell_m).astype(np.int64)
-        high = np.floor((points.max(axis=0) - self.origin) / self.cell_m).astype(np.int64)
-        ny, nx = self.state.shape
-        if low[0] >= 0 and low[1] >= 0 and high[0] < nx and high[1] < ny:
-            return
-        before = np.where(low < 0, -low + MARGIN_CELLS, 0)
-        after = np.where(high >= (nx, ny), high - (nx, ny) + 1 + MARGIN_CELLS, 0)
-        new_nx, new_ny = int(nx + before[0] + after[0]), int(ny + before[1] + after[1])
-        if new_nx * new_ny > MAX_CELLS:
+        grown = growth(self.state.shape, self.origin, self.cell_m, points)
+        if grown is None:
             return
         old = self.sums
-        self._allocate(new_ny, new_nx)
-        self.sums[before[1] : before[1] + ny, before[0] : before[0] + nx] = old
-        self.origin = self.origin - before * self.cell_m
+        self._allocate(*grown.shape)
+        self.sums[grown.held] = old
+        self.origin = grown.origin

@@ -14,6 +14,7 @@ from companion.messages import Array, LevelledScan, LidarScan
 from companion.odometry import level_kernels as lk
 from companion.odometry.attitude import AttitudeHistory
 
+NOISE_RATE = 0.05  # of a scan in what is known of the noise of returns
 MIN_BENDS = 50  # of which the noise of returns is told
 BLOCK_RAD = math.radians(2.9)  # neighbours of a layer that are averaged: 4 of 512 columns
 
@@ -84,6 +85,21 @@ def range_noise_m(range_m: NDArray[np.float32]) -> float:
     """
     bend, count = lk.median_bend(range_m)
     return bend / (0.6745 * math.sqrt(6.0)) if count >= MIN_BENDS else math.nan
+
+
+class ReturnNoise:
+    """Standard deviation of single returns, kept from scan to scan."""
+
+    def __init__(self) -> None:
+        self.sigma_m = 0.1
+        self._is_known = False
+
+    def see(self, range_m: NDArray[np.float32]) -> None:
+        """Take in the ranges (columns,) of the horizontal layer."""
+        now = range_noise_m(range_m)
+        if math.isfinite(now):
+            self.sigma_m += (NOISE_RATE if self._is_known else 1.0) * (now - self.sigma_m)
+            self._is_known = True
 
 
 def block_means(levelled: LevelledScan, above_row: int, columns: int, min_range_m: float) -> Array:

@@ -11,12 +11,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 from companion.config import CompanionConfig
-from companion.geometry import rotation2
 from companion.messages import (
     Array,
     AttitudeSample,
@@ -32,7 +30,8 @@ from companion.odometry.attitude import AttitudeBuffer, AttitudeHistory
 from companion.odometry.degeneracy import Judgement, judge, weak_direction
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
-from companion.odometry.level import Leveller, block_means, range_noise_m, wall_layer
+from companion.odometry.keyframes import PlacedScan, WaitingScans
+from companion.odometry.level import Leveller, ReturnNoise, block_means, wall_layer
 from companion.odometry.ranges import wall_ranges
 from companion.odometry.relocalise import relocalise
 from companion.odometry.standstill import Standstill
@@ -43,9 +42,6 @@ FLOOR_VARIANCE = np.array([0.004, 0.004, 0.0004]) ** 2  # what a registration er
 KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
 KEYFRAME_HEIGHT_LOW_M = 0.2  # below LOW_M, where nothing yet tells walls from the foot of a pile
 LOW_M = 1.5
-MAX_PENDING = 100  # scans kept until the next keyframe
-STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
-NOISE_RATE = 0.05  # of a scan in what is known of the noise of returns
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
 WAIT_FOR_FIRST_SCANS = 5
@@ -72,18 +68,6 @@ class ScanResult:
     tilt_offset_rad: tuple[float, float]
 
 
-class _Pending(NamedTuple):
-    """A registered scan that waits for the next keyframe: layer (N, 2), ground (M, 4), sensor (3,), levelled; pose x, y,
-    yaw, z."""
-
-    layer: Array
-    ground: Array
-    sensor: Array
-    pose: Array
-    z_m: float
-    variance: Array  # (4,) x, y, yaw, z
-
-
 class Odometry:
     """One instance for one flight. on_attitude, on_rangefinder and predict may be called while on_scan runs in another
     thread: what they share is immutable and replaced by single assignments."""
@@ -100,9 +84,9 @@ class Odometry:
         self._standstill = Standstill()
         self._is_released = False  # the filter, from standing at the origin
         self._standing_scans = 0
-        self._pending: list[_Pending] = []
+        self._waiting = WaitingScans()
         self._sigma_range_m = 0.1
-        self._return_sigma_m = math.nan  # of single returns: the registration's also holds what walls are rough by
+        self._return_noise = ReturnNoise()  # of single returns: the registration's also holds what walls are rough by
         self._accepted = 0
         self._usual_share = 0.0  # of the layer's points that found a wall, lately
         self._is_weak, self._is_lost = False, False  # along an axis: not held by walls; nor known well enough to map
@@ -164,7 +148,7 @@ class Odometry:
         row = scan.geometry.horizontal_row
         layer = wall_layer(levelled, row, self.height.floor_below_m(float(vertical.x[0])))
         near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
-        self._track_return_noise(scan)
+        self._return_noise.see(scan.range_m[row])
         lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None
         if old is None:
@@ -183,8 +167,8 @@ class Odometry:
         variance = np.array([planar.p[0, 0], planar.p[1, 1], planar.p[6, 6], vertical.p[0, 0]]) + snapshot.map_variance
         if judgement is None or (judgement.is_accepted and not self._is_lost):
             sensor = levelled.origin_level_m
-            self._pending.append(_Pending(layer, ground, sensor, planar.x[kalman.POSE], float(vertical.x[0]), variance))
-            del self._pending[:-MAX_PENDING]
+            pose, z_m = planar.x[kalman.POSE], float(vertical.x[0])
+            self._waiting.add(PlacedScan(layer, ground, sensor, pose, z_m, variance))
         if snapshot.is_keyframe:
             self._close_keyframe(scan.t_ns, float(vertical.x[0]), is_first=old is None)
         self._snapshot = snapshot
@@ -333,13 +317,6 @@ class Odometry:
         rate = max(0.01, 0.3 / (1 + self._accepted / 5))
         self._sigma_range_m = min(max(self._sigma_range_m * scale**rate, 0.01), 0.5)
 
-    def _track_return_noise(self, scan: LidarScan) -> None:
-        now = range_noise_m(scan.range_m[scan.geometry.horizontal_row])
-        if math.isnan(self._return_sigma_m):
-            self._return_sigma_m = now if math.isfinite(now) else self._sigma_range_m
-        elif math.isfinite(now):
-            self._return_sigma_m += NOISE_RATE * (now - self._return_sigma_m)
-
     def _stand(
         self,
         history: AttitudeHistory,
@@ -364,7 +341,7 @@ class Odometry:
         self._is_released = True
         self.height.leave_ground()
         self._base_variance = noise / max(1, self._standing_scans)
-        del self._pending[-STANDING_DELAY:]
+        self._waiting.drop_moved()
         still = self._standstill
         return kalman.let_go(planar, still.gyro_offset_radps, still.stood_s), kalman.let_go_vertical(vertical, z_shift)
 
@@ -410,18 +387,8 @@ class Odometry:
         )
 
     def _close_keyframe(self, t_ns: int, z_m: float, *, is_first: bool) -> None:
-        """Put the waiting scans into the maps; while standing the newest wait on, since motion is noticed late."""
-        keep = STANDING_DELAY if self._standstill.is_standing and not is_first else 0
-        ready = self._pending[: len(self._pending) - keep]
-        self._pending = self._pending[len(self._pending) - keep :]
-        for waiting in ready:
-            r = rotation2(float(waiting.pose[2])).T
-            self.walls.insert(waiting.layer @ r + waiting.pose[:2], waiting.z_m, waiting.variance[:3])
-            sight = waiting.ground.copy()
-            sight[:, :2] = waiting.ground[:, :2] @ r
-            origin = np.array([*waiting.pose[:2], waiting.z_m])
-            sensor = np.array([*(waiting.sensor[:2] @ r), waiting.sensor[2]])
-            self.height.ground.insert(sight, origin, sensor, self._return_sigma_m, float(waiting.variance[3]))
+        is_standing = self._standstill.is_standing and not is_first
+        self._waiting.put_into(self.walls, self.height.ground, self._return_noise.sigma_m, is_standing=is_standing)
         self._keyframe_t_ns, self._keyframe_z_m = t_ns, z_m
 
 

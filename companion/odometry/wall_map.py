@@ -11,9 +11,7 @@ import numpy as np
 
 from companion.messages import Array
 from companion.odometry import kernels
-
-MARGIN_CELLS = 64  # grown by at least this much at a time
-MAX_CELLS = 4_000_000  # 36 hectares at 0.3 m; points beyond are left out
+from companion.odometry.grid_growth import growth
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,19 +115,11 @@ class WallMap:
         )
 
     def _cover(self, points: Array) -> None:
-        """Grow the grid, at most to MAX_CELLS, so that the points lie within."""
-        low = np.floor((points.min(axis=0) - self.origin) / self.cell_m).astype(np.int64)
-        high = np.floor((points.max(axis=0) - self.origin) / self.cell_m).astype(np.int64)
-        ny, nx = self.state.shape
-        if low[0] >= 0 and low[1] >= 0 and high[0] < nx and high[1] < ny:
-            return
-        before = np.where(low < 0, -low + MARGIN_CELLS, 0)
-        after = np.where(high >= (nx, ny), high - (nx, ny) + 1 + MARGIN_CELLS, 0)
-        new_nx, new_ny = int(nx + before[0] + after[0]), int(ny + before[1] + after[1])
-        if new_nx * new_ny > MAX_CELLS:
+        """Grow the grid so that the points lie within."""
+        grown = growth(self.state.shape, self.origin, self.cell_m, points)
+        if grown is None:
             return
         old = self.sums, self.spread
-        self._allocate(new_ny, new_nx)
-        part = np.s_[before[1] : before[1] + ny, before[0] : before[0] + nx]
-        self.sums[part], self.spread[part] = old
-        self.origin = self.origin - before * self.cell_m
+        self._allocate(*grown.shape)
+        self.sums[grown.held], self.spread[grown.held] = old
+        self.origin = grown.origin

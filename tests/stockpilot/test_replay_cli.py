@@ -16,7 +16,7 @@ from companion.recording.manifest import write_manifest
 from companion.recording.replay import Replay
 from companion.recording.run_files import Input, read_run
 from stockpilot.cli import main as stockpilot_main
-from stockpilot.replay import recorded_config, replay_command, replay_run
+from stockpilot.replay import describe, recorded_config, replay_command, replay_run
 from stockpilot.replay_check import REPLAYS
 from stockpilot.replay_edit import rebuild_scans
 
@@ -115,6 +115,20 @@ def test_report_measures_the_map_again(flown: Path, tmp_path: Path) -> None:
     assert code == 0
     assert said["volume_m3"] >= 0.0
     assert {p.name for p in (tmp_path / "again").iterdir()} == {"map.ply", "trajectory.tum", "report.json"}
+
+
+def test_report_is_set_beside_what_the_run_told(flown: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(flown, folder)
+    told = {"keyframes": 12, "volume_m3": 34.5, "volume_interval_m3": [30.0, 39.0], "seen_ratio": 0.5, "seed": 3}
+    (folder / "report.json").write_text(json.dumps(told), encoding="utf-8")
+    _, said = run(folder, "--report", "--set", "odometry.keyframe_period_s=3.2")
+    assert said["recorded"] == {
+        key: told[key] for key in ("keyframes", "volume_m3", "volume_interval_m3", "seen_ratio")
+    }
+    assert "the run itself told volume 34.50 m3, interval 30.00 to 39.00, seen 50.0%, keyframes 12" in describe(said)
+    _, said = run(flown, "--report")
+    assert said["recorded"] == {}
 
 
 def test_replay_of_a_recording_without_its_scans_says_so(flown: Path) -> None:
