@@ -212,6 +212,8 @@ class Odometry:
         return MIN_VALID_COLUMNS_FIRST_RATIO if is_waiting else MIN_VALID_COLUMNS_RATIO
 
     def _first(self, scan: LidarScan, planar: kalman.Planar, vertical: kalman.Vertical) -> Snapshot:
+        if self._return_noise.sigma_m > 2.0 * self._sigma_range_m:  # else the second scan would not fit the first
+            self._sigma_range_m = self._return_noise.sigma_m
         return Snapshot(
             t_scan_ns=scan.t_ns,
             planar=planar,
