@@ -20,6 +20,7 @@ BESIDE_COLUMNS, BEFORE_COLUMNS = (
     3,
     2,
 )  # how far off its neighbours, and itself one scan before, may be: 14 deg/s at 10 Hz
+MOST_SPECKS_RATIO = 0.035  # of the layer's columns: in thicker dust every return counts, and stops the vehicle
 COMPANIONS = 2  # neighbours that make a thing of a return: a hand's breadth at two metres
 
 
@@ -132,6 +133,8 @@ def _specks(layer: Array, one: Array, two: Array) -> NDArray[np.bool_]:
         if beside < COMPANIONS:
             was_there = _was_there(one, c, reach, BEFORE_COLUMNS) and _was_there(two, c, reach, 2 * BEFORE_COLUMNS)
             is_speck[c] = not was_there
+    if np.sum(is_speck) > MOST_SPECKS_RATIO * columns:
+        is_speck[:] = False
     return is_speck
 
 
