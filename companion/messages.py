@@ -202,9 +202,9 @@ class WallRanges:
     centre. front/right: eq. 4 and 5 of the paper (robust over a few neighbouring beams).
 
     ranges_m: (360,) horizontal distance by bearing in whole degrees, counter-clockwise from forward; inf where unseen
-    or beyond range; nearest return of each sector (unfiltered: for the obstacle stop). is_seen: (360,) bool, True where
-    the sector's columns arrived, even if nothing came back (inf and seen: free as far as the sensor reaches; inf and not
-    seen: lost packets, nobody knows).
+    or beyond range; nearest return of each sector, without near specks that stand alone (odometry/ranges.py). is_seen:
+    (360,) bool, True where the sector's columns arrived, even if nothing came back (inf and seen: free as far as the
+    sensor reaches; inf and not seen: lost packets, or only specks: nobody knows).
     """
 
     t_ns: int

@@ -41,6 +41,8 @@ REQUEST_EVERY_NS = 1_000_000_000
 BREACH_M = 0.5  # beyond a limit by this: not a matter of clamping any more
 FLOOR_M = 0.3  # above the place of take-off: lower only in the flight controller's land mode
 NEAR_GROUND_M = 1.0  # measured below: do not sink further
+ROOM_BELOW_M = 1.0  # by which the rangefinder may read more than the height above the start, and
+ROOM_BELOW_SLOPE = 0.03  # more for each metre from there: the floor may fall away
 DEGENERATE_SPEED_RATIO = 0.5
 LANDING_MODES = frozenset({FlightMode.LAND, FlightMode.DESCEND})
 TELL_AGAIN_NS = 10_000_000_000
@@ -98,7 +100,7 @@ class Guard:
         self._note(inputs, t_ns)
         vision_s = self._vision_age_s(t_ns)
         self.is_silent = vision_s > self._cfg.silent_after_s
-        breach = self._breach(t_ns)
+        breach = self._breach(t_ns, inputs.below_m)
         requests = self._requests(t_ns, inputs.vehicle, vision_s, events)
         if setpoint is None:
             return GuardVerdict(setpoint=None, requests=requests, events=tuple(events))
@@ -191,18 +193,23 @@ class Guard:
             return "the position is uncertain"
         return ""
 
-    def _breach(self, t_ns: int) -> str:
-        """Outside the box although every setpoint was clamped: something is wrong."""
+    def _breach(self, t_ns: int, below_m: float | None) -> str:
+        """Outside the box although every setpoint was clamped, or higher than the estimate knows: something is wrong."""
         if self._estimate is None or not self._was_armed:
             self._breach_ns = None
             return ""
         off = self._estimate.position_map_m - self._start
         high = off[2] > self._cfg.max_height_m + BREACH_M
-        far = math.hypot(off[0], off[1]) > self._cfg.max_distance_m + BREACH_M
-        if not (high or far):
+        from_start_m = math.hypot(off[0], off[1])
+        far = from_start_m > self._cfg.max_distance_m + BREACH_M
+        room_m = ROOM_BELOW_M + ROOM_BELOW_SLOPE * from_start_m
+        deep = below_m is not None and math.isfinite(below_m) and below_m - max(float(off[2]), 0.0) > room_m
+        if not (high or far or deep):
             self._breach_ns = None
             return ""
         self._breach_ns = t_ns if self._breach_ns is None else self._breach_ns
+        if deep and not (high or far):
+            return "the rangefinder reads more height than the estimate has"
         return "above the height limit" if high else "beyond the fence"
 
     def _requests(
@@ -220,7 +227,7 @@ class Guard:
             if unseen_ns > after_ns:
                 why = "vision is lost"
             elif self._breach_ns is not None and t_ns - self._breach_ns > after_ns:
-                why = "outside the box"
+                why = "outside the box, or its height is wrong"
         if not why or t_ns - self._asked_ns < REQUEST_EVERY_NS:
             return ()
         self._asked_ns = t_ns

@@ -30,6 +30,11 @@ SHIFT_SIGMA_M = 0.008  # of x and y beside their covariance: lines are a little 
 TILT_FLOOR_RAD = 0.0002
 MAX_TILT_RAD = math.radians(4.0)
 MAX_REJECTED = 10
+CONTRADICTED_M = (
+    0.5  # by which the rangefinder may differ from a height that was refused before: dust passes for ground
+)
+FRESH_NS = 500_000_000  # age of a reading that still counts
+OVER_GROUND_SIGMA_M = 0.15  # of the height by rangefinder and ground map, off the start
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,10 +132,14 @@ class HeightTracker:
         fit = self.fit(lower, planar, vertical, walls, sigma_m)
         self._highest_m = max(self._highest_m, float(vertical.x[0]))
         sigma_z = math.inf
-        if fit.ground_points >= MIN_GROUND_POINTS:
+        if fit.ground_points >= MIN_GROUND_POINTS and math.isfinite(fit.correction[0]):
             sigma_z = math.sqrt(1.0 / (float(fit.information[0, 0]) + 1e-3) + Z_FLOOR_SIGMA_M**2)
             gate = max(MIN_GATE_M, GATE_SIGMAS * math.hypot(math.sqrt(float(vertical.p[0, 0])), sigma_z))
-            if abs(fit.correction[0]) < gate or self._rejected >= MAX_REJECTED:
+            by_range = self._over_ground(planar.x[kalman.POSE]) if self._rejected >= MAX_REJECTED else None
+            refit = float(vertical.x[0] + fit.correction[0])
+            if by_range is not None and abs(refit - by_range) > CONTRADICTED_M:
+                vertical = kalman.update_vertical(vertical, by_range, OVER_GROUND_SIGMA_M**2)
+            elif abs(fit.correction[0]) < gate or self._rejected >= MAX_REJECTED:
                 vertical = kalman.update_vertical(vertical, float(vertical.x[0] + fit.correction[0]), sigma_z**2)
                 self.map_variance = fit.map_variance
                 self._rejected = 0
@@ -140,6 +149,13 @@ class HeightTracker:
         ground = fit.new_ground
         result = HeightResult(fit.correction, sigma_z, ground, fit.ground_points, fit.wall_points)
         return vertical, result
+
+    def _over_ground(self, pose: Array) -> float | None:
+        """Height by the newest reading above the ground that the map has there; None where either is missing or old."""
+        known = self.ground.height_at(float(pose[0]), float(pose[1]))
+        if known is None or not self._rangefinder or self._t_ns - self._rangefinder[-1].t_ns > FRESH_NS:
+            return None
+        return known[0] + self._rangefinder[-1].distance_m
 
     def _track_tilt(self, fit: HeightFit, dt_s: float) -> None:
         """Take over what the walls told of the tilt, beside a random walk that is drawn back to 0."""

@@ -93,7 +93,8 @@ def fit_plane(sums: Array, state: NDArray[np.uint8], planes: Array, iy: int, ix:
         return
     mx, my, mz = t[X] / w, t[Y] / w, t[Z] / w
     sxx, syy = max(t[XX] / w - mx * mx, 0.0), max(t[YY] / w - my * my, 0.0)
-    sxy = t[XY] / w - mx * my
+    most = math.sqrt(sxx * syy)  # noise taken out of few points may leave moments that no points have
+    sxy = min(max(t[XY] / w - mx * my, -most), most)
     sxz, syz, szz = t[XZ] / w - mx * mz, t[YZ] / w - my * mz, max(t[ZZ] / w - mz * mz, 0.0)
     noise = 0.1**2
     ridge = noise / (w * SLOPE_SIGMA**2) + LEAN_M2

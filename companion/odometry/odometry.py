@@ -8,6 +8,7 @@ walls of the first keyframe hold the pose for the whole flight.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,8 +32,8 @@ from companion.odometry.degeneracy import Judgement, judge, weak_direction
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
 from companion.odometry.keyframes import PlacedScan, WaitingScans
-from companion.odometry.level import Leveller, ReturnNoise, block_means, wall_layer
-from companion.odometry.ranges import wall_ranges
+from companion.odometry.level import AllReturns, Leveller, ReturnNoise, block_means, wall_layer
+from companion.odometry.ranges import layer_ranges, wall_ranges
 from companion.odometry.relocalise import relocalise
 from companion.odometry.standstill import Standstill
 from companion.odometry.wall_map import Registration, WallMap
@@ -85,6 +86,7 @@ class Odometry:
         self._is_released = False  # the filter, from standing at the origin
         self._standing_scans = 0
         self._waiting = WaitingScans()
+        self._layers: deque[Array] = deque(maxlen=2)  # of the last two scans
         self._sigma_range_m = 0.1
         self._return_noise = ReturnNoise()  # of single returns: the registration's also holds what walls are rough by
         self._accepted = 0
@@ -175,7 +177,7 @@ class Odometry:
         return ScanResult(
             estimate=estimate_at(snapshot, history, scan.t_ns, is_scan=True),
             levelled=levelled,
-            wall_ranges=wall_ranges(scan, every, self._leveller.r_body_lidar, self._cfg.lidar.min_range_m),
+            wall_ranges=self._look_around(scan, every),
             keyframe=snapshot.is_keyframe,
             registration=registration,
             judgement=judgement,
@@ -185,6 +187,12 @@ class Odometry:
         )
 
     # -- steps
+
+    def _look_around(self, scan: LidarScan, every: AllReturns) -> WallRanges:
+        r_body_lidar, least_m = self._leveller.r_body_lidar, self._cfg.lidar.min_range_m
+        before = (self._layers[-1], self._layers[-2]) if len(self._layers) == 2 else None
+        self._layers.append(layer_ranges(scan))
+        return wall_ranges(scan, every, r_body_lidar, least_m, before)
 
     def _is_unusable(self, scan: LidarScan, history: AttitudeHistory | None) -> bool:
         reason = ""
@@ -204,6 +212,8 @@ class Odometry:
         return MIN_VALID_COLUMNS_FIRST_RATIO if is_waiting else MIN_VALID_COLUMNS_RATIO
 
     def _first(self, scan: LidarScan, planar: kalman.Planar, vertical: kalman.Vertical) -> Snapshot:
+        if self._return_noise.sigma_m > 2.0 * self._sigma_range_m:  # else the second scan would not fit the first
+            self._sigma_range_m = self._return_noise.sigma_m
         return Snapshot(
             t_scan_ns=scan.t_ns,
             planar=planar,

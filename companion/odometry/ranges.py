@@ -14,18 +14,46 @@ from companion.odometry.level_kernels import middle_of
 
 HALF_WIDTH_RAD = math.radians(4.0)  # beams about the bearing of eq. 4 and 5: the median of a dozen instead of one
 MIN_BEAMS = 3
+NEAR_M = 4.0  # nearer than this a return that stands alone may be a speck of dust, and would stop the vehicle
+TOGETHER_M = 0.4  # of range between returns of one thing: three sigma of the noise
+BESIDE_COLUMNS, BEFORE_COLUMNS = (
+    3,
+    2,
+)  # how far off its neighbours, and itself one scan before, may be: 14 deg/s at 10 Hz
+MOST_SPECKS_RATIO = 0.035  # of the layer's columns: in thicker dust every return counts, and stops the vehicle
+COMPANIONS = 2  # neighbours that make a thing of a return: a hand's breadth at two metres
 
 
-def wall_ranges(scan: LidarScan, every: AllReturns, r_body_lidar: Array, min_range_m: float) -> WallRanges:
+def layer_ranges(scan: LidarScan) -> Array:
+    """(columns,) ranges of the horizontal layer, inf where nothing came back."""
+    layer = np.asarray(scan.range_m[scan.geometry.horizontal_row], np.float64)
+    return np.where((layer > 0.0) & (layer < np.inf) & scan.column_valid, layer, np.inf)
+
+
+def wall_ranges(
+    scan: LidarScan,
+    every: AllReturns,
+    r_body_lidar: Array,
+    min_range_m: float,
+    before: tuple[Array, Array] | None = None,
+) -> WallRanges:
     """Distances from the body's centre in the horizontal layer.
+
+    before: `layer_ranges` of the two scans before this one. A near return counts where it has neighbours, or where it
+    came in each of the three scans; one that stands alone is a speck of dust, and nobody knows what lies behind it.
 
     The paper counts beams from behind, clockwise: index r/2 looks ahead and r/4... to the right with its sensor's
     order reversed; here both are found by bearing, so that the order of the beams does not matter (docs/paper.md).
     """
+    layer = layer_ranges(scan)
+    one, two = before if before is not None and before[0].shape == before[1].shape == layer.shape else (layer, layer)
+    is_speck = _specks(layer, one, two) if before is not None else np.zeros(len(layer), np.bool_)
     front, right, ranges, is_seen = _look_around(
         every.points_level,
         every.range_m,
         every.row,
+        every.column,
+        is_speck,
         scan.geometry.horizontal_row,
         min_range_m,
         scan.geometry.directions[scan.geometry.horizontal_row],
@@ -46,6 +74,8 @@ def _look_around(
     points: Array,
     range_m: Array,
     row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    is_speck: NDArray[np.bool_],
     layer_row: int,
     min_range_m: float,
     directions: Array,
@@ -54,14 +84,14 @@ def _look_around(
 ) -> tuple[float, float, Array, NDArray[np.bool_]]:
     """Front and right (NaN: too few beams), (360,) nearest by bearing, (360,) where anybody looked.
 
-    points: (N, 3) levelled, range_m, row: (N,) of all returns. directions: (columns, 3) of the layer's beams, lidar
-    frame; column_valid: (columns,) those that arrived.
+    points: (N, 3) levelled, range_m, row, column: (N,) of all returns. is_speck: (columns,) of the layer.
+    directions: (columns, 3) of the layer's beams, lidar frame; column_valid: (columns,) those that arrived.
     """
     ranges, is_seen = np.full(360, np.inf), np.zeros(360, np.bool_)
     ahead, right = np.empty(len(row)), np.empty(len(row))
     n_ahead, n_right = 0, 0
     for i in range(len(row)):
-        if row[i] != layer_row:
+        if row[i] != layer_row or is_speck[column[i]]:
             continue
         x, y = points[i, 0], points[i, 1]
         bearing = math.atan2(y, x)
@@ -78,7 +108,7 @@ def _look_around(
     for k in range(360):
         is_seen[k] = ranges[k] < np.inf
     for c in range(len(column_valid)):
-        if column_valid[c]:  # looked there, also where nothing came back
+        if column_valid[c] and not is_speck[c]:  # looked there, also where nothing came back
             d = directions[c]
             x = d[0] * r_body_lidar[0, 0] + d[1] * r_body_lidar[0, 1] + d[2] * r_body_lidar[0, 2]
             y = d[0] * r_body_lidar[1, 0] + d[1] * r_body_lidar[1, 1] + d[2] * r_body_lidar[1, 2]
@@ -86,6 +116,34 @@ def _look_around(
     front_m = middle_of(ahead, n_ahead) if n_ahead >= MIN_BEAMS else np.nan  # eq. 4
     right_m = middle_of(right, n_right) if n_right >= MIN_BEAMS else np.nan  # eq. 5
     return front_m, right_m, ranges, is_seen
+
+
+@kernel
+def _specks(layer: Array, one: Array, two: Array) -> NDArray[np.bool_]:
+    """(columns,) near returns that stand alone. layer, one, two: (columns,) ranges of this scan and the two before."""
+    columns = len(layer)
+    is_speck = np.zeros(columns, np.bool_)
+    for c in range(columns):
+        reach = layer[c]
+        if reach >= NEAR_M:
+            continue
+        beside = -1  # itself
+        for k in range(-BESIDE_COLUMNS, BESIDE_COLUMNS + 1):
+            beside += int(abs(layer[(c + k) % columns] - reach) <= TOGETHER_M)
+        if beside < COMPANIONS:
+            was_there = _was_there(one, c, reach, BEFORE_COLUMNS) and _was_there(two, c, reach, 2 * BEFORE_COLUMNS)
+            is_speck[c] = not was_there
+    if np.sum(is_speck) > MOST_SPECKS_RATIO * columns:
+        is_speck[:] = False
+    return is_speck
+
+
+@kernel
+def _was_there(layer: Array, column: int, reach: float, within: int) -> bool:
+    found = False
+    for k in range(-within, within + 1):
+        found = found or abs(layer[(column + k) % len(layer)] - reach) <= TOGETHER_M
+    return found
 
 
 @kernel

@@ -292,6 +292,18 @@ def test_outside_the_box_it_holds_then_lands(at):
     assert 2.0 <= requests[0][0] <= 2.2
 
 
+@pytest.mark.parametrize(("height", "below", "breach"), [(9.0, 11.0, True), (9.0, 9.2, False), (9.0, 3.0, False)])
+def test_a_height_that_the_rangefinder_gives_the_lie_to_holds_then_lands(height, below, breach):
+    """Dust that passed for ground once lifted the estimate's floor, and the vehicle to the ceiling."""
+    rig = GuardRig()
+    requests = []
+    for _ in range(60):
+        verdict = rig.check(0.1, 0.0, 0.0, at=(2.0, 0.0, height), below_m=below)
+        assert is_still(verdict) is breach
+        requests += [r.kind for r in verdict.requests]
+    assert (RequestKind.LAND in requests) is breach
+
+
 def test_back_inside_the_box_it_flies_on():
     rig = GuardRig()
     assert is_still(rig.check(0.1, 0.0, 0.0, at=(0.0, 0.0, 15.0)))

@@ -102,3 +102,14 @@ def test_noise_of_returns_is_told_from_a_layer_with_walls_edges_and_gaps() -> No
     ranges[100:110] = 2.0
     assert range_noise_m(ranges.astype(np.float32)) == pytest.approx(NOISE_M, rel=0.12)
     assert math.isnan(range_noise_m(np.zeros(512, dtype=np.float32)))
+
+
+def test_few_noisy_returns_give_planes_that_points_can_have() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(200):
+        ground = HeightMap()
+        points = ring(rng, count=8)
+        points[:, :3] *= 1.0 + rng.normal(0.0, 0.1, (8, 1))
+        ground.insert(points, np.zeros(3), SENSOR, 0.6, 0.0)
+        known = [ground.height_at(x, y) for x, y in points[:, :2]]
+        assert all(math.isfinite(height[0]) and height[1] > 0.0 for height in known if height is not None)
