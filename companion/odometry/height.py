@@ -30,9 +30,7 @@ SHIFT_SIGMA_M = 0.008  # of x and y beside their covariance: lines are a little 
 TILT_FLOOR_RAD = 0.0002
 MAX_TILT_RAD = math.radians(4.0)
 MAX_REJECTED = 10
-CONTRADICTED_M = (
-    0.5  # by which the rangefinder may differ from a height that was refused before: dust passes for ground
-)
+CONTRADICTED_M = 0.5  # by which the rangefinder may differ from a height that was refused before (dust)
 FRESH_NS = 500_000_000  # age of a reading that still counts
 OVER_GROUND_SIGMA_M = 0.15  # of the height by rangefinder and ground map, off the start
 
@@ -140,7 +138,7 @@ class HeightTracker:
             if by_range is not None and abs(refit - by_range) > CONTRADICTED_M:
                 vertical = kalman.update_vertical(vertical, by_range, OVER_GROUND_SIGMA_M**2)
             elif abs(fit.correction[0]) < gate or self._rejected >= MAX_REJECTED:
-                vertical = kalman.update_vertical(vertical, float(vertical.x[0] + fit.correction[0]), sigma_z**2)
+                vertical = kalman.update_vertical(vertical, refit, sigma_z**2)
                 self.map_variance = fit.map_variance
                 self._rejected = 0
             else:

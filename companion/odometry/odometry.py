@@ -86,7 +86,7 @@ class Odometry:
         self._is_released = False  # the filter, from standing at the origin
         self._standing_scans = 0
         self._waiting = WaitingScans()
-        self._layers: deque[Array] = deque(maxlen=2)  # of the last two scans
+        self._layers: deque[Array] = deque(maxlen=3)  # of the last scans, newest first
         self._sigma_range_m = 0.1
         self._return_noise = ReturnNoise()  # of single returns: the registration's also holds what walls are rough by
         self._accepted = 0
@@ -190,9 +190,8 @@ class Odometry:
 
     def _look_around(self, scan: LidarScan, every: AllReturns) -> WallRanges:
         r_body_lidar, least_m = self._leveller.r_body_lidar, self._cfg.lidar.min_range_m
-        before = (self._layers[-1], self._layers[-2]) if len(self._layers) == 2 else None
-        self._layers.append(layer_ranges(scan))
-        return wall_ranges(scan, every, r_body_lidar, least_m, before)
+        self._layers.appendleft(layer_ranges(scan))
+        return wall_ranges(scan, every, r_body_lidar, least_m, self._layers)
 
     def _is_unusable(self, scan: LidarScan, history: AttitudeHistory | None) -> bool:
         reason = ""

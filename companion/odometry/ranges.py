@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,8 @@ HALF_WIDTH_RAD = math.radians(4.0)  # beams about the bearing of eq. 4 and 5: th
 MIN_BEAMS = 3
 NEAR_M = 4.0  # nearer than this a return that stands alone may be a speck of dust, and would stop the vehicle
 TOGETHER_M = 0.4  # of range between returns of one thing: three sigma of the noise
-BESIDE_COLUMNS, BEFORE_COLUMNS = (
-    3,
-    2,
-)  # how far off its neighbours, and itself one scan before, may be: 14 deg/s at 10 Hz
+BESIDE_COLUMNS = 3  # how far off its neighbours may be
+BEFORE_COLUMNS = 2  # how far off itself one scan before: 14 deg/s at 10 Hz
 MOST_SPECKS_RATIO = 0.035  # of the layer's columns: in thicker dust every return counts, and stops the vehicle
 COMPANIONS = 2  # neighbours that make a thing of a return: a hand's breadth at two metres
 
@@ -35,19 +34,19 @@ def wall_ranges(
     every: AllReturns,
     r_body_lidar: Array,
     min_range_m: float,
-    before: tuple[Array, Array] | None = None,
+    layers: Sequence[Array] = (),
 ) -> WallRanges:
     """Distances from the body's centre in the horizontal layer.
 
-    before: `layer_ranges` of the two scans before this one. A near return counts where it has neighbours, or where it
-    came in each of the three scans; one that stands alone is a speck of dust, and nobody knows what lies behind it.
+    layers: `layer_ranges` of this scan and the two before it, newest first; fewer: every return counts. A near return
+    counts where it has neighbours, or where it came in each of the three; one that stands alone is a speck of dust, and
+    nobody knows what lies behind it.
 
     The paper counts beams from behind, clockwise: index r/2 looks ahead and r/4... to the right with its sensor's
     order reversed; here both are found by bearing, so that the order of the beams does not matter (docs/paper.md).
     """
-    layer = layer_ranges(scan)
-    one, two = before if before is not None and before[0].shape == before[1].shape == layer.shape else (layer, layer)
-    is_speck = _specks(layer, one, two) if before is not None else np.zeros(len(layer), np.bool_)
+    is_comparable = len(layers) == 3 and len({layer.shape for layer in layers}) == 1
+    is_speck = _specks(*layers) if is_comparable else np.zeros(len(scan.column_valid), np.bool_)
     front, right, ranges, is_seen = _look_around(
         every.points_level,
         every.range_m,
