@@ -3,6 +3,8 @@ later the compiled code is read from disk. A made-up room is scanned; nothing of
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from companion.config import CompanionConfig
@@ -16,9 +18,12 @@ from companion.messages import (
     LidarScan,
     RangefinderSample,
     VehicleState,
+    WallRanges,
 )
 from companion.navigator import NavigatorInput
 from companion.navigator.guard import GuardInput
+from companion.navigator.obstacles import Surroundings, allowed_speed
+from companion.navigator.scan_view import ScanView
 from companion.odometry.relocalise import relocalise
 
 ROOM_M = np.array([8.0, 6.0, 2.0])  # half lengths of the room; its floor is that far below the sensor
@@ -50,6 +55,18 @@ def warm_up(config: CompanionConfig) -> None:
         if n == SCANS - 1:
             layer = result.levelled.points_level[result.levelled.row == geometry.horizontal_row][:, :2]
             relocalise(flight.odometry.walls, np.ascontiguousarray(layer), np.zeros(3), 0.01 * np.eye(3), 0.0, 0.1)
+            _look_about(walls)
+
+
+def _look_about(walls: WallRanges) -> None:
+    """What the navigator and the guard ask of a scan only once they fly."""
+    view = ScanView.of(walls)
+    view.wall(-math.pi, math.pi)
+    view.ahead(0.0, 1.0, 1.0)
+    surroundings = Surroundings(stop_distance_m=2.0, deceleration_mps2=1.0)
+    surroundings.see(walls, 0.0, 0.0, 0.0)
+    surroundings.limit(np.array([5.0, 0.0]), 0.0, 0.0, walls.t_ns)
+    allowed_speed(1.0, 1.0)
 
 
 def _scan(geometry: LidarGeometry, n: int, t_ns: int, moved_m: float, rng: np.random.Generator) -> LidarScan:

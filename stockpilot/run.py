@@ -15,6 +15,7 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from companion.errors import ConfigError
 from companion.flight import Flight
+from companion.warm_up import warm_up
 from simbridge.autopilot import Autopilot
 from simbridge.config import SimConfig
 from simbridge.loop import Simulation
@@ -113,6 +114,8 @@ def run_command(
     folder = out or Path("runs") / f"{mission.name}-{mission.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)
+    console.print("warming up (a minute the first time on a computer) ...", style="dim")
+    warm_up(mission.companion)
     with ExitStack() as stack:
         show = stack.enter_context(_progress(console))
         recorder = None

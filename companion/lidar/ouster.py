@@ -142,13 +142,14 @@ class OusterDecoder:
         self._t_last_ns: int | None = None
         self._dtype = _packet_dtype(self._format, self._pixel, info.h, profile)
         slots = -(-info.w // self._columns_per_packet)
-        self._packets: list[bytes] = [b""] * slots  # of the open frame; empty where none came yet
+        self._packets: list[bytes] = [bytes(self._packet_size)] * slots
         self._received = 0
         self._frame_id: int | None = None
         self._is_open = False
         self._is_restarted = False
         self._last: LidarScan | None = None
-        self._decode(0)  # compiles what decodes now, and not while packets wait
+        self._decode(0)  # blank packets: compiles what decodes now, and not while packets wait
+        self._packets = [b""] * slots  # of the open frame; empty where none came yet
 
     @classmethod
     def from_config(cls, cfg: LidarConfig) -> OusterDecoder:

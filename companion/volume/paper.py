@@ -1,7 +1,8 @@
 """The paper's own volume (section 2.3), beside ours on the same map.
 
 What the text says: a uniform grid over the inspected space R, the heights of the whole map M interpolated on it
-linearly (`griddata`), and the double integral of that surface (eq. 6). It leaves two things open, chosen here so:
+linearly (MATLAB's `griddata`: Delaunay's triangles, as in linear.py), and the double integral of that surface (eq. 6).
+It leaves two things open, chosen here so:
 
 - R. Section 4 says that the estimate always exceeds the truth "because of the walls and the ground that need to be
   excluded from M", and an error of 3 % cannot be had with the walls inside R (they alone add more than half of the
@@ -15,16 +16,16 @@ linearly (`griddata`), and the double integral of that surface (eq. 6). It leave
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import griddata
 from scipy.spatial import ConvexHull, QhullError
 
 from companion.messages import Array
+from companion.volume.linear import linear_on_grid
 
 PAPER_CELL_M = 0.25
 WALL_BAND_M = (
     1.0  # noise of 0.12 m throws the outermost of a million returns 0.6 m out, and the wall's own band is 0.36
 )
-MAX_POINTS = 200_000  # griddata triangulates every point: more of the same scans change little but the time
+MAX_POINTS = 200_000  # the surface triangulates every point: more of the same scans change little but the time
 
 
 def paper_volume(
@@ -56,12 +57,11 @@ def paper_volume(
     key, of_node = np.unique((cm[:, 0] << 32) | (cm[:, 1] & 0xFFFFFFFF), return_inverse=True)
     height = np.bincount(of_node, z) / np.bincount(of_node)
     node = np.column_stack([key >> 32, key & 0xFFFFFFFF])
-    x, y = np.meshgrid(*(np.arange(wall_band_m + cell_m / 2, side - wall_band_m, cell_m) for side in size))
-    if x.size == 0:
+    x, y = (np.arange(wall_band_m + cell_m / 2, side - wall_band_m, cell_m) for side in size)
+    if len(x) == 0 or len(y) == 0:
         return float("nan")
-    try:
-        surface = griddata(node * 0.01, height, (x, y), method="linear")
-    except QhullError:
+    surface = linear_on_grid(node * 0.01, height, x, y)
+    if np.isnan(surface).all():
         return float("nan")
     return float(np.nansum(surface) * cell_m**2)  # eq. 6
 

@@ -8,11 +8,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import QhullError
 
 from companion.messages import Array
 from companion.volume.grid import Grid, Index, LocalPlanes, Mask, cells_of, disc, local_planes
+from companion.volume.linear import linear_on_grid
 
 LAYER_GAP_M = 1.0  # emptiness over one cell that parts the surface from what hangs in the air above it
 MIN_POINTS = 3  # a cell with fewer is not seen
@@ -219,7 +218,8 @@ def build_surface(
     if seen.any():
         gap, nearest = ndimage.distance_transform_edt(~seen, return_indices=True)
         gap = gap * grid.cell_m
-        z = _between(grid, cells, seen)
+        nodes = np.column_stack([cells.x[seen] - grid.x0_m, cells.y[seen] - grid.y0_m])
+        z = linear_on_grid(nodes, cells.z[seen], grid.x_m - grid.x0_m, grid.y_m - grid.y0_m)
         carried = _carried_on(grid, cells, planes, nearest)
         z = np.where(strip | ~np.isfinite(z), carried, z)
     state = np.full(grid.shape, CellState.UNSEEN, dtype=np.int8)
@@ -235,16 +235,6 @@ def build_surface(
         slope_x=np.nan_to_num(planes.slope_x),
         slope_y=np.nan_to_num(planes.slope_y),
     )
-
-
-def _between(grid: Grid, cells: Cells, seen: Mask) -> Array:
-    cx, cy = grid.centres()
-    nodes = np.column_stack([cells.x[seen] - grid.x0_m, cells.y[seen] - grid.y0_m])
-    try:
-        surface = LinearNDInterpolator(nodes, cells.z[seen])
-    except (QhullError, ValueError):
-        return np.full(grid.shape, np.nan)
-    return np.asarray(surface(cx - grid.x0_m, cy - grid.y0_m))
 
 
 def _carried_on(grid: Grid, cells: Cells, planes: LocalPlanes, nearest: NDArray[np.integer]) -> Array:
