@@ -80,6 +80,9 @@ class MappingConfig(Section):
 class VolumeConfig(Section):
     cell_m: Positive = Field(0.25, ge=0.05, le=5.0)
     interval_level: float = Field(0.95, gt=0.5, lt=1.0)
+    range_offset_sigma_m: NonNegative = Field(
+        0.002, le=1.0, description="1 sigma of what the sensor adds to all its ranges, as left by its calibration"
+    )
 
 
 class MavlinkConfig(Section):

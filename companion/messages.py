@@ -6,7 +6,7 @@ odometry began), `body` (forward, left, up), `lidar` (as the device says). See d
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -281,6 +281,7 @@ class PointMap:
     points_map: (N, 3) float64. keyframe_id: (N,) int64. range_m: (N,) float64, distance at which it was measured.
     path_map: (K, 3) float64, the flown path (places known to be free air).
     position_sigma_m, height_sigma_m: typical 1-sigma of the poses that placed the points.
+    scan_index: (N,) int64, the row of path_map that each point was seen from; None: not known.
     """
 
     points_map: Array
@@ -289,6 +290,17 @@ class PointMap:
     path_map: Array
     position_sigma_m: float = 0.0
     height_sigma_m: float = 0.0
+    scan_index: NDArray[np.int64] | None = None
+
+    def only(self, keep: NDArray[np.bool_]) -> PointMap:
+        """The same map with some of its points: keep is (N,)."""
+        return replace(
+            self,
+            points_map=self.points_map[keep],
+            keyframe_id=self.keyframe_id[keep],
+            range_m=self.range_m[keep],
+            scan_index=None if self.scan_index is None else self.scan_index[keep],
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

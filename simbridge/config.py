@@ -222,6 +222,9 @@ class LidarSimConfig(Section):
     mount_position_m: Vector = Field((0.0, 0.0, 0.08), description="of the sensor in body (forward, left, up)")
     mount_rpy_deg: Vector = Field((0.0, 0.0, 0.0), description="of the sensor in body: roll, pitch, yaw")
     noise_m: NonNegative = Field(0.12, le=5, description="1 sigma of the range")
+    offset_sigma_m: NonNegative = Field(
+        0.002, le=1, description="1 sigma of what a unit adds to all its ranges; how much this one does, the seed says"
+    )
     rows_off: tuple[int, ...] = Field((), description="beams switched off, 0 is the highest: they return nothing")
     mount_error_rpy_deg: Vector = Field((0.0, 0.0, 0.0), description="true mount minus mount_rpy_deg")
     mount_error_position_m: Vector = Field((0.0, 0.0, 0.0), description="true mount minus mount_position_m")

@@ -47,6 +47,8 @@ class Lidar:
         self._noise = np.zeros((cfg.columns, len(self._rows)))
         self._chance = np.zeros((cfg.columns, len(self._rows), 3))
         self._params = _parameters(cfg)
+        self._offset_m = cfg.offset_sigma_m * float(stream(seed, "lidar offset").standard_normal())
+        self.range_bias_m = 0.0
         self._packets_per_turn = cfg.columns // COLUMNS_PER_PACKET
         most = self._per_s * step_ns // NS + 2  # columns of the longest step
         self._shifts, self._origin = np.zeros((most, 3)), np.zeros(3)
@@ -57,12 +59,12 @@ class Lidar:
 
     @property
     def range_bias_m(self) -> float:
-        """Added to every range: a fault."""
-        return float(self._params[BIAS])
+        """Added to every range beside the unit's own offset: a fault."""
+        return float(self._params[BIAS]) - self._offset_m
 
     @range_bias_m.setter
     def range_bias_m(self, bias_m: float) -> None:
-        self._params[BIAS] = bias_m
+        self._params[BIAS] = bias_m + self._offset_m
 
     def cast(self, t_middle_ns: int, t_end_ns: int, before: Array, pose: Array, motion: Array) -> list[bytes]:
         """Measure the columns up to t_end and give the packets that are done.

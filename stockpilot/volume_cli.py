@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -137,9 +138,9 @@ def _load(cloud: Path) -> PointMap:
 def _scaled(point_map: PointMap, scale: float) -> PointMap:
     if scale == 1.0:
         return point_map
-    return PointMap(
+    return replace(
+        point_map,
         points_map=point_map.points_map * scale,
-        keyframe_id=point_map.keyframe_id,
         range_m=point_map.range_m * scale,
         path_map=point_map.path_map * scale,
         position_sigma_m=point_map.position_sigma_m * scale,
@@ -169,14 +170,7 @@ def _checked(cloud: Path, point_map: PointMap) -> PointMap:
         )
     if span[2] > 2 * max(span[:2]):
         raise FileFormatError(f"{cloud}: {told} m is taller than it is wide: is z up in it?")
-    return PointMap(
-        points_map=points,
-        keyframe_id=point_map.keyframe_id[finite],
-        range_m=point_map.range_m[finite],
-        path_map=point_map.path_map,
-        position_sigma_m=point_map.position_sigma_m,
-        height_sigma_m=point_map.height_sigma_m,
-    )
+    return point_map.only(finite)
 
 
 def _coarse_step_m(point_map: PointMap) -> float:

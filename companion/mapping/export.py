@@ -6,13 +6,15 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.errors import FileFormatError
 from companion.mapping.ply import Columns, read_ply, write_ply
-from companion.messages import PointMap
+from companion.messages import Array, PointMap
 
 VLR_USER = "stockpilot"
 VLR_RECORD = 1
@@ -70,6 +72,8 @@ def _save_ply(point_map: PointMap, path: Path) -> None:
         "range": point_map.range_m.astype(np.float32),
         "keyframe": point_map.keyframe_id.astype(np.int32),
     }
+    if point_map.scan_index is not None:
+        vertex["scan"] = point_map.scan_index.astype(np.int32)
     flown: Columns = {name: point_map.path_map[:, i] for i, name in enumerate("xyz")}
     comments = [
         "stockpilot map, metres, z up",
@@ -87,14 +91,23 @@ def _load_ply(path: Path) -> PointMap:
     points = np.column_stack([vertex[a] for a in "xyz"]).astype(np.float64)
     told = dict(c.split(" ", 1) for c in comments if " " in c)
     flown = elements.get("path", {})
+    path_map = np.column_stack([flown[a] for a in "xyz"]).astype(np.float64) if flown else np.zeros((0, 3))
     return PointMap(
         points_map=points,
         keyframe_id=vertex.get("keyframe", np.zeros(len(points))).astype(np.int64),
         range_m=vertex.get("range", np.zeros(len(points))).astype(np.float64),
-        path_map=np.column_stack([flown[a] for a in "xyz"]).astype(np.float64) if flown else np.zeros((0, 3)),
+        path_map=path_map,
         position_sigma_m=_number(told.get("position_sigma_m")),
         height_sigma_m=_number(told.get("height_sigma_m")),
+        scan_index=_scan_index(vertex.get("scan"), path_map),
     )
+
+
+def _scan_index(told: NDArray[Any] | None, path_map: Array) -> NDArray[np.int64] | None:
+    """Rows of the path; None where the file tells none, or such as its path does not have."""
+    index = None if told is None else np.asarray(told, dtype=np.int64)
+    fits = index is not None and bool(((index >= 0) & (index < len(path_map))).all())
+    return index if fits else None
 
 
 def _number(text: str | None) -> float:
@@ -108,7 +121,8 @@ def _save_las(point_map: PointMap, path: Path) -> None:
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = np.full(3, LAS_SCALE_M)
     header.offsets = np.floor(point_map.points_map.min(axis=0)) if len(point_map.points_map) else np.zeros(3)
-    header.add_extra_dims([laspy.ExtraBytesParams("range", np.float32), laspy.ExtraBytesParams("keyframe", np.int32)])
+    kinds = {"range": np.float32, "keyframe": np.int32} | ({} if point_map.scan_index is None else {"scan": np.int32})
+    header.add_extra_dims([laspy.ExtraBytesParams(name, kind) for name, kind in kinds.items()])
     told = {
         "path_map": np.round(point_map.path_map, 4).tolist(),
         "position_sigma_m": point_map.position_sigma_m,
@@ -125,6 +139,8 @@ def _save_las(point_map: PointMap, path: Path) -> None:
     las.x, las.y, las.z = point_map.points_map.T
     las["range"] = point_map.range_m.astype(np.float32)
     las["keyframe"] = point_map.keyframe_id.astype(np.int32)
+    if point_map.scan_index is not None:
+        las["scan"] = (point_map.scan_index // step).astype(np.int32)
     las.write(str(path), do_compress=path.suffix.lower() == ".laz")
 
 
@@ -139,13 +155,15 @@ def _load_las(path: Path) -> PointMap:
     for vlr in las.header.vlrs:
         if getattr(vlr, "user_id", "") == VLR_USER and getattr(vlr, "record_id", 0) == VLR_RECORD:
             told = json.loads(bytes(vlr.record_data))
+    path_map = np.asarray(told.get("path_map", []), dtype=np.float64).reshape(-1, 3)
     return PointMap(
         points_map=points,
         keyframe_id=np.asarray(las["keyframe"] if "keyframe" in names else np.zeros(len(points)), dtype=np.int64),
         range_m=np.asarray(las["range"] if "range" in names else np.zeros(len(points)), dtype=np.float64),
-        path_map=np.asarray(told.get("path_map", []), dtype=np.float64).reshape(-1, 3),
+        path_map=path_map,
         position_sigma_m=float(str(told.get("position_sigma_m", 0.0))),
         height_sigma_m=float(str(told.get("height_sigma_m", 0.0))),
+        scan_index=_scan_index(las["scan"] if "scan" in names else None, path_map),
     )
 
 

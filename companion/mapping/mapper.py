@@ -12,7 +12,7 @@ from companion.geometry import matrix_from_quat, yaw_from_quat
 from companion.mapping.outliers import is_solid
 from companion.messages import Array, LevelledScan, OdometryEstimate, PointMap
 
-MAX_POINTS = 3_000_000  # about 50 MB; a lap of the cement store is 1.4 million
+MAX_POINTS = 3_000_000  # about 60 MB; a lap of the cement store is 1.4 million
 FIRST_VOXEL_M = 0.05
 MAX_JUMP_SIGMA_M = 1.0  # a pose less certain than this paints nothing
 
@@ -26,6 +26,7 @@ class _Keyframe:
     points: list[NDArray[np.float32]]
     range_m: list[NDArray[np.float32]]
     path: list[Array]
+    seen_from: list[NDArray[np.int32]]  # places in path
 
     @property
     def size(self) -> int:
@@ -72,6 +73,7 @@ class Mapper:
         to_keyframe = matrix_from_quat(keyframe.q_map_body_wxyz)  # rows of points times R is R transposed times columns
         keyframe.points.append(((points_map - keyframe.position_map_m) @ to_keyframe).astype(np.float32))
         keyframe.range_m.append(levelled.range_m[keep].astype(np.float32))
+        keyframe.seen_from.append(np.full(int(keep.sum()), len(keyframe.path), np.int32))
         keyframe.path.append((estimate.position_map_m - keyframe.position_map_m) @ to_keyframe)
         self._variances.append(
             (
@@ -95,12 +97,15 @@ class Mapper:
     def point_map(self) -> PointMap:
         """The map as it now stands, with the typical 1 sigma of the poses that placed it."""
         points, ids, ranges, path = [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)], [np.zeros(0)], [np.zeros((0, 3))]
+        seen_from, scans = [np.zeros(0, dtype=np.int64)], 0
         for keyframe_id, keyframe in sorted(self._keyframes.items()):
             rotation = matrix_from_quat(keyframe.q_map_body_wxyz)
             for chunk in keyframe.points:
                 points.append(chunk.astype(np.float64) @ rotation.T + keyframe.position_map_m)
                 ids.append(np.full(len(chunk), keyframe_id, dtype=np.int64))
             ranges += [r.astype(np.float64) for r in keyframe.range_m]
+            seen_from += [scans + s.astype(np.int64) for s in keyframe.seen_from]
+            scans += len(keyframe.path)
             path.append(np.array(keyframe.path) @ rotation.T + keyframe.position_map_m)
         variances = np.array(self._variances) if self._variances else np.zeros((1, 2))
         sigma = np.sqrt(np.median(variances, axis=0))
@@ -111,12 +116,13 @@ class Mapper:
             path_map=np.concatenate(path),
             position_sigma_m=float(sigma[0]),
             height_sigma_m=float(sigma[1]),
+            scan_index=np.concatenate(seen_from),
         )
 
     def _keyframe(self, estimate: OdometryEstimate) -> _Keyframe:
         keyframe = self._keyframes.get(estimate.keyframe_id)
         if keyframe is None:
-            keyframe = _Keyframe(estimate.position_map_m.copy(), estimate.q_map_body_wxyz.copy(), [], [], [])
+            keyframe = _Keyframe(estimate.position_map_m.copy(), estimate.q_map_body_wxyz.copy(), [], [], [], [])
             self._keyframes[estimate.keyframe_id] = keyframe
         return keyframe
 
@@ -129,10 +135,12 @@ class Mapper:
         while self._size > 0.75 * self._max_points:
             for keyframe in self._keyframes.values():
                 points, ranges = np.concatenate(keyframe.points), np.concatenate(keyframe.range_m)
+                seen_from = np.concatenate(keyframe.seen_from)
                 voxel = np.floor(points.astype(np.float64) / self._voxel_m).astype(np.int64)
                 _, first = np.unique(_voxel_key(voxel), return_index=True)
                 first.sort()
                 keyframe.points, keyframe.range_m = [points[first]], [ranges[first]]
+                keyframe.seen_from = [seen_from[first]]
             self._size = sum(k.size for k in self._keyframes.values())
             self._voxel_m *= 1.5
         self.points_thinned += before - self._size

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from companion.config import VolumeConfig
 from companion.messages import Array, PointMap, VolumeReport
+from companion.volume.beams import where_beams_meet
 from companion.volume.contact import Contact, fit_contact
 from companion.volume.doubt import doubt
 from companion.volume.floor import Floor, fit_floor, level_floor
@@ -22,6 +23,7 @@ MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
 
 LEAST_KEYFRAMES = 6  # that see the floor, before their disagreement on it is judged
+LEAST_FROM_ABOVE = 0.3  # of the map's points
 BESIDE_WALLS_M = 1.0  # beyond the strip
 
 
@@ -36,13 +38,17 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
     Returns: the report. A poor map is told by `warnings` and a wide interval, never by an exception; a map that shows
         no surface at all gives volume NaN and the interval (0, inf).
     """
-    points = point_map.points_map
+    points, told = point_map.points_map, point_map.scan_index
+    if told is not None and (len(told) != len(points) or not _are_rows(told, point_map.path_map)):
+        point_map = replace(point_map, scan_index=None)  # of another path, or another cloud
     finite: Mask = np.asarray(np.isfinite(points).all(axis=1))
     if not finite.all():
-        point_map = _only(point_map, finite)
+        point_map = point_map.only(finite)
         points = point_map.points_map
     if len(points) < MIN_MAP_POINTS:
         return _nothing(cfg, f"the map has only {len(points)} points: no surface can be told")
+    point_map = _seen_from_above(point_map)
+    points = point_map.points_map
     grid = grid_around(points, cfg.cell_m)
     key = grid.key(points)
     footprint = find_footprint(point_map, grid, key)
@@ -50,6 +56,7 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
     low = points[:, 2] < footprint.ceiling_m
     wanted = (key >= 0) & low & ~strip.ravel()[np.maximum(key, 0)]
     cells = robust_cells(points, np.where(wanted, key, -1), grid)
+    cells = where_beams_meet(point_map, cells, grid, ~strip & (footprint.share > 0), footprint.noise_m)
     if footprint.has_walls:
         cells = without_strays(cells, grid, footprint.depth_m < footprint.margin_m + BESIDE_WALLS_M)
     usable = cells.seen & (footprint.share > 0)
@@ -117,6 +124,9 @@ def _report(
         pile=pile,
         depth_m=footprint.depth_m,
         has_walls=footprint.has_walls,
+        keyframes=len(np.unique(point_map.keyframe_id)),
+        range_offset_sigma_m=cfg.range_offset_sigma_m,
+        told_sigma_m=point_map.position_sigma_m,
         position_sigma_m=position_sigma,
         height_sigma_m=point_map.height_sigma_m if disagreement is None else disagreement,
         floor_disagreement_m=disagreement or 0.0,
@@ -145,6 +155,20 @@ def _report(
         footprint_m=footprint.polygon_m,
         error_budget_m3=tuple(budget.items()),
     )
+
+
+def _are_rows(index: Index, of: Array) -> bool:
+    return bool(((index >= 0) & (index < len(of))).all())
+
+
+def _seen_from_above(point_map: PointMap) -> PointMap:
+    """Without what was seen in the climb and the landing: the attitude's bias (0.2 to 0.4 deg) is found on the way up, and
+    what was seen before, from afar and flat, is centimetres off. All of it where that would leave little."""
+    if point_map.scan_index is None:
+        return point_map
+    height = point_map.path_map[point_map.scan_index, 2]
+    keep = height >= 0.5 * np.median(height)
+    return point_map.only(keep) if keep.sum() >= LEAST_FROM_ABOVE * len(keep) else point_map
 
 
 def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
@@ -186,17 +210,6 @@ def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> fl
     # No less than what noise could hide.
     explained = float(np.mean(np.var(r) / n[seen]))
     return float(np.sqrt(max(spread - explained, explained)))
-
-
-def _only(point_map: PointMap, keep: Mask) -> PointMap:
-    return PointMap(
-        points_map=point_map.points_map[keep],
-        keyframe_id=point_map.keyframe_id[keep],
-        range_m=point_map.range_m[keep],
-        path_map=point_map.path_map,
-        position_sigma_m=point_map.position_sigma_m,
-        height_sigma_m=point_map.height_sigma_m,
-    )
 
 
 def _nothing(cfg: VolumeConfig, why: str) -> VolumeReport:

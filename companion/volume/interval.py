@@ -19,8 +19,10 @@ from companion.volume.floor import BLOCK_M, Floor
 from companion.volume.grid import Grid, Mask
 from companion.volume.surface import Cells, CellState, Surface
 
-RANGE_BIAS_SIGMA_M = 0.002  # left of the sensor's range offset after its factory calibration; assumed, see docstring
-POSE_SIDES = 3.0  # over how many independent errors a lap's poses average, seen from one flank
+POSES_ALIKE = 6.0  # keyframes in a row that share most of their error
+LEAST_ERRORS = 3.0  # independent ones that a lap's poses average over, however short it was
+LEAST_FLOOR_CELLS = 50
+SHARED_WITH_FLOOR = 0.5  # of an error in height: the same scans see the floor, from which the material is counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +39,9 @@ class Evidence:
     pile: Mask
     depth_m: Array
     has_walls: bool
+    keyframes: int
+    range_offset_sigma_m: float
+    told_sigma_m: float
     position_sigma_m: float
     height_sigma_m: float
     floor_disagreement_m: float
@@ -50,11 +55,14 @@ def error_budget(e: Evidence) -> dict[str, float]:
     flanks = _flanks(e, area)
     flank = math.sqrt(sum(f * f for f in flanks))
     gaps, hidden = _interpolation(e, area)
+    # What the keyframes disagree by beyond what registration tells of itself is drift: a whole side shares it.
+    drift_m = math.sqrt(max(e.position_sigma_m**2 - e.told_sigma_m**2, 0.0))
+    averaged = math.sqrt(max(LEAST_ERRORS, e.keyframes / POSES_ALIKE))
     return {
         "returns": _sampling(e, area),
-        "position": e.position_sigma_m * flank / math.sqrt(POSE_SIDES),
-        "height": e.height_sigma_m * pile_area / POSE_SIDES,
-        "range": RANGE_BIAS_SIGMA_M * (0.3 * pile_area + 0.7 * sum(flanks)),
+        "position": flank * math.hypot(e.told_sigma_m / averaged, drift_m / math.sqrt(LEAST_ERRORS)),
+        "height": e.height_sigma_m * pile_area * SHARED_WITH_FLOOR / averaged,
+        "range": e.range_offset_sigma_m * abs(_per_range(e, area, flanks)),
         "floor": _floor(e, area),
         "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _face(e),
         "contact": _contact_height(e, area),
@@ -81,6 +89,21 @@ def _flanks(e: Evidence, area: Array) -> tuple[float, float, float, float]:
     sides = (np.maximum(gx, 0), np.maximum(-gx, 0), np.maximum(gy, 0), np.maximum(-gy, 0))
     a, b, c, d = (float(side.sum()) for side in sides)
     return a, b, c, d
+
+
+def _per_range(e: Evidence, area: Array, flanks: tuple[float, ...]) -> float:
+    """Volume that a metre added to all ranges adds: the pile sinks along its beams, and so does the floor below it."""
+    rise = e.cells.rise
+    on_floor = e.floor.cells & np.isfinite(rise) if rise is not None else np.zeros(e.grid.shape, dtype=np.bool_)
+    if rise is None or on_floor.sum() < LEAST_FLOOR_CELLS:
+        return 0.3 * float(area.sum()) + 0.7 * sum(flanks)  # beams 20 to 45 deg down, from all sides
+    x, y = e.grid.centres()
+    design = np.stack([np.ones(e.grid.shape), x, y], axis=-1)
+    plane = np.linalg.lstsq(design[on_floor], rise[on_floor], rcond=None)[0]
+    known = np.isfinite(rise) & e.pile
+    seen = float(area[known].sum())
+    moved = float(np.sum((area * (rise - design @ plane))[known]))
+    return moved * float(area.sum()) / seen if seen > 0 else 0.0
 
 
 def _floor(e: Evidence, area: Array) -> float:

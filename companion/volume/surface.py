@@ -33,6 +33,7 @@ class Cells:
 
     sigma_m: 1 sigma of z from the spread of the returns. kept: how many returns. dropped_ratio: share of all returns
     that hung in the air or lay far off the surface. of_point: for each point its cell when kept, else -1.
+    rise: metres by which z rises for a metre added to the ranges; NaN where no beams were told.
     """
 
     x: Array
@@ -42,6 +43,7 @@ class Cells:
     kept: Array
     dropped_ratio: float
     of_point: Index
+    rise: Array | None = None
 
     @property
     def seen(self) -> Mask:

@@ -56,4 +56,4 @@ def test_no_kernel_is_compiled_once_it_flies() -> None:
     assert "follow" in seen["phases"]
     late = {name: n for name, n in seen["flying"].items() if n > seen["warm"].get(name, 0)}
     assert not late, f"compiled in flight: {late}"
-    assert len(seen["warm"]) > 20 and all(seen["warm"][name] for name in seen["flying"] if seen["flying"][name])
+    assert len(seen["warm"]) > 20

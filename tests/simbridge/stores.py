@@ -43,7 +43,7 @@ def sim_config(**sections: Any) -> SimConfig:
         "barometer": {"noise_hpa": 0, "drift_hpa": 0},
         "rangefinder": {"noise_m": 0},
     }
-    lidar: dict[str, Any] = {"noise_m": 0.0, "grazing_deg": 89.9}
+    lidar: dict[str, Any] = {"noise_m": 0.0, "offset_sigma_m": 0.0, "grazing_deg": 89.9}
     return SimConfig.model_validate(
         {
             **sections,

@@ -153,6 +153,25 @@ def test_noise_has_its_size_and_no_bias() -> None:
     assert np.abs(error).max() < 0.8
 
 
+def test_a_units_own_offset_is_drawn_by_the_seed_and_a_fault_comes_on_top() -> None:
+    def offset_m(seed: int, is_wrong: bool = False) -> float:
+        exact, off = flying(seed=seed), flying(seed=seed, lidar={"offset_sigma_m": 0.05})
+        if is_wrong:
+            faults = [{"target": "lidar", "kind": "wrong", "at_s": 0.0, "wrong_by": 0.5}]
+            off = flying(seed=seed, lidar={"offset_sigma_m": 0.05}, faults=faults)
+        a = np.stack([ranges_m(f) for f in frames(run(exact, 0.25), exact.lidar_metadata_json())])
+        b = np.stack([ranges_m(f) for f in frames(run(off, 0.25), off.lidar_metadata_json())])
+        error = (b - a)[(a > 1) & (b > 1)]
+        assert error.std() < 0.001
+        return float(error.mean())
+
+    drawn = [offset_m(seed) for seed in range(4)]
+    assert len({round(d, 3) for d in drawn}) == 4
+    assert max(abs(d) for d in drawn) < 0.2
+    assert drawn[0] == pytest.approx(offset_m(0), abs=1e-9)
+    assert offset_m(1, is_wrong=True) == pytest.approx(drawn[1] + 0.5, abs=0.002)
+
+
 def test_beams_that_are_off_return_nothing_and_the_others_stay() -> None:
     all_on, some_off = flying(), flying(lidar={"rows_off": [1, 4]})
     a = ranges_m(frames(run(all_on, 0.25), all_on.lidar_metadata_json())[0])

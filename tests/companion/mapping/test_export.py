@@ -23,6 +23,7 @@ def point_map() -> PointMap:
         path_map=rng.uniform(-20, 20, (40, 3)),
         position_sigma_m=0.0173,
         height_sigma_m=0.008,
+        scan_index=rng.integers(0, 40, 500),
     )
 
 
@@ -32,6 +33,8 @@ def test_ply_comes_back_to_the_last_bit(point_map: PointMap, tmp_path: Path) -> 
     assert back.points_map.tobytes() == point_map.points_map.tobytes()
     assert back.path_map.tobytes() == point_map.path_map.tobytes()
     assert (back.keyframe_id == point_map.keyframe_id).all()
+    assert back.scan_index is not None
+    assert (back.scan_index == point_map.scan_index).all()
     assert (back.range_m == point_map.range_m).all()
     assert (back.position_sigma_m, back.height_sigma_m) == (0.0173, 0.008)
 
@@ -43,6 +46,8 @@ def test_las_comes_back_to_a_tenth_of_a_millimetre(point_map: PointMap, tmp_path
     assert np.abs(back.points_map - point_map.points_map).max() <= 0.5e-4 + 1e-9
     assert np.abs(back.path_map - point_map.path_map).max() <= 0.5e-4 + 1e-9
     assert (back.keyframe_id == point_map.keyframe_id).all()
+    assert back.scan_index is not None
+    assert (back.scan_index == point_map.scan_index).all()
     assert back.position_sigma_m == 0.0173
 
 
@@ -51,10 +56,15 @@ def test_long_path_fits_into_a_las_record(point_map: PointMap, tmp_path: Path) -
         points_map=point_map.points_map,
         keyframe_id=point_map.keyframe_id,
         range_m=point_map.range_m,
-        path_map=np.random.default_rng(1).uniform(-200, 200, (20_000, 3)),
+        path_map=np.cumsum(np.random.default_rng(1).uniform(-0.01, 0.01, (20_000, 3)), axis=0),
+        scan_index=np.linspace(0, 19_999, 500).astype(np.int64),
     )
     save_point_map(long, tmp_path / "map.las")
-    assert 1000 < len(load_point_map(tmp_path / "map.las").path_map) < 20_000
+    back = load_point_map(tmp_path / "map.las")
+    assert 1000 < len(back.path_map) < 20_000
+    assert back.scan_index is not None
+    seen_from = back.path_map[back.scan_index] - long.path_map[np.linspace(0, 19_999, 500).astype(np.int64)]
+    assert np.abs(seen_from).max() < 0.5
 
 
 def test_empty_map_is_written_and_read(tmp_path: Path) -> None:

@@ -238,6 +238,7 @@ def make_map(hall: Hall, flight: Flight, seed: int) -> Synthetic:
         path_map=position,
         position_sigma_m=said,
         height_sigma_m=flight.height_sigma_m,
+        scan_index=np.repeat(np.arange(k), len(fan))[hit],
     )
     return Synthetic(point_map=point_map, true_volume_m3=float(pile.sum() * FINE_M**2), true_points=true_points[hit])
 

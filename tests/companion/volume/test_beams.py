@@ -1,0 +1,69 @@
+"""Noise along the beam does not bend the surface, and the interval knows what an offset of the ranges would do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from companion.config import VolumeConfig
+from companion.messages import VolumeReport
+from companion.volume import estimate_volume
+from tests.companion.volume.synthetic import make_map
+from tests.companion.volume.test_volume import GOOD_POSES, HALLS
+
+EXACT = dataclasses.replace(GOOD_POSES, position_sigma_m=0.0, height_sigma_m=0.0, noise_m=0.12)
+
+
+@pytest.mark.parametrize("name", ["free-standing", "silo"])
+def test_knowing_the_beams_takes_the_noise_out_of_the_surface(name: str) -> None:
+    made = make_map(HALLS[name], EXACT, 3)
+    with_beams = estimate_volume(made.point_map, VolumeConfig())
+    without = estimate_volume(dataclasses.replace(made.point_map, scan_index=None), VolumeConfig())
+    perfect = estimate_volume(dataclasses.replace(made.point_map, points_map=made.true_points), VolumeConfig())
+
+    def rms(report: VolumeReport) -> float:
+        x, of_x, of_perfect_x = np.intersect1d(report.x_m, perfect.x_m, return_indices=True)
+        y, of_y, of_perfect_y = np.intersect1d(report.y_m, perfect.y_m, return_indices=True)
+        assert len(x) > 100
+        assert len(y) > 100
+        there = np.ix_(of_perfect_y, of_perfect_x)
+        off = report.surface_z_m[np.ix_(of_y, of_x)] - perfect.surface_z_m[there]
+        return float(np.sqrt(np.nanmean(off[perfect.cell_state[there] == 1] ** 2)))
+
+    assert rms(with_beams) < 0.98 * rms(without)
+    assert abs(with_beams.volume_m3 / made.true_volume_m3 - 1) < 0.0025
+
+
+def test_the_share_of_a_range_offset_is_what_an_offset_does() -> None:
+    made = make_map(HALLS["free-standing"], EXACT, 4).point_map
+    assert made.scan_index is not None
+    beams = made.points_map - made.path_map[made.scan_index]
+    beams /= np.linalg.norm(beams, axis=1)[:, None]
+    longer = dataclasses.replace(made, points_map=made.points_map + 0.02 * beams)
+    cfg = VolumeConfig(range_offset_sigma_m=0.02)
+    told = dict(estimate_volume(made, cfg).error_budget_m3)["range"]
+    moved = estimate_volume(longer, cfg).volume_m3 - estimate_volume(made, cfg).volume_m3
+    assert told == pytest.approx(abs(moved), rel=0.25)
+
+
+def test_what_was_seen_in_the_climb_with_a_tilted_attitude_does_not_count() -> None:
+    made = make_map(HALLS["free-standing"], EXACT, 5).point_map
+    assert made.scan_index is not None
+    low = made.path_map[made.scan_index, 2] < 4.0
+    assert 0.01 < low.mean() < 0.5
+    tilted = made.points_map.copy()
+    tilted[low, 2] += 0.02 * (made.points_map[low, 0] - made.path_map[0, 0])
+    volume = estimate_volume(made, VolumeConfig()).volume_m3
+    assert estimate_volume(dataclasses.replace(made, points_map=tilted), VolumeConfig()).volume_m3 == volume
+
+
+def test_an_index_of_another_path_is_not_used() -> None:
+    made = make_map(HALLS["free-standing"], EXACT, 6).point_map
+    assert made.scan_index is not None
+    none = estimate_volume(dataclasses.replace(made, scan_index=None), VolumeConfig())
+    beyond = dataclasses.replace(made, scan_index=made.scan_index + len(made.path_map))
+    fewer = dataclasses.replace(made, scan_index=made.scan_index[:-1])
+    assert estimate_volume(beyond, VolumeConfig()).volume_m3 == none.volume_m3
+    assert estimate_volume(fewer, VolumeConfig()).volume_m3 == none.volume_m3
