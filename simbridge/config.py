@@ -247,7 +247,9 @@ class LidarSimConfig(Section):
 
 
 class AutopilotConfig(Section):
-    kind: Literal["emulated", "px4", "ardupilot"] = Field("emulated", description="which flight controller flies")
+    kind: Literal["emulated", "px4", "ardupilot"] = Field(
+        "emulated", description="which flight controller flies, unless --autopilot says another"
+    )
     params: dict[str, float] = Field(default_factory=dict, description="PX4 parameters by name")
 
 

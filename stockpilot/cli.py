@@ -42,6 +42,10 @@ SeedOption = Annotated[
     int | None, typer.Option(help="seed of all noise; the same seed gives the same result to the last bit")
 ]
 OutOption = Annotated[Path | None, typer.Option(help="folder for the results; default runs/<mission>-<seed>")]
+AutopilotOption = Annotated[
+    str | None,
+    typer.Option(help="emulated, px4 or ardupilot (the last two need a SITL binary); default: as autopilot.kind says"),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the result as JSON on stdout")]
 
 
@@ -51,9 +55,7 @@ def run(
     seed: SeedOption = None,
     out: OutOption = None,
     settings: SetOption = None,
-    autopilot: Annotated[
-        str, typer.Option(help="emulated, px4 or ardupilot (the last two need a SITL binary)")
-    ] = "emulated",
+    autopilot: AutopilotOption = None,
     autopilot_binary: Annotated[Path | None, typer.Option(help="SITL binary to start; else one is waited for")] = None,
     record: Annotated[bool, typer.Option(help="write recording.mcap, telemetry.tlog beside the results")] = True,
     as_json: JsonOption = False,
@@ -78,7 +80,7 @@ def sim(
     mission: MissionArgument,
     seed: SeedOption = None,
     settings: SetOption = None,
-    autopilot: Annotated[str, typer.Option(help="emulated, px4 or ardupilot")] = "emulated",
+    autopilot: AutopilotOption = None,
     autopilot_binary: Annotated[Path | None, typer.Option(help="SITL binary to start; else one is waited for")] = None,
     offboard: Annotated[str, typer.Option(help="where the companion listens for MAVLink")] = "udpout://127.0.0.1:14540",
     ground: Annotated[

@@ -60,6 +60,11 @@ def emulated(cfg: SimConfig, links: tuple[str, ...] = (OFFBOARD,)) -> tuple[Simu
     return Simulation(cfg, controller), controller
 
 
+def flight_controller_of(mission: Mission) -> str:
+    """emulated, px4 or ardupilot, as the mission says."""
+    return mission.sim.autopilot.kind if mission.sim is not None else "emulated"
+
+
 def prepare(mission: Mission, *, autopilot: str = "emulated", binary: Path | None = None) -> Prepared:
     """Build the world, the flight controller and the companion. Raises: ConfigError: no world; no such autopilot."""
     if mission.sim is None:
@@ -104,13 +109,14 @@ def fly_lockstep(
 
 
 def run_command(
-    path: Path, *, seed: int | None, out: Path | None, settings: list[str], autopilot: str, binary: Path | None,
+    path: Path, *, seed: int | None, out: Path | None, settings: list[str], autopilot: str | None, binary: Path | None,
     record: bool, as_json: bool,
 ) -> int:  # fmt: skip
     """Exit code: 0 completed, 1 not."""
     from stockpilot.leave import write_results
 
     mission = load_mission(path, settings, seed=seed)
+    autopilot = autopilot or flight_controller_of(mission)
     folder = out or Path("runs") / f"{mission.name}-{mission.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)

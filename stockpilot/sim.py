@@ -35,13 +35,14 @@ def open_link(option: str, url: str, preferred_port: int = 0) -> UdpLink:
 
 
 def sim_command(
-    path: Path, *, seed: int | None, settings: list[str], autopilot: str, binary: Path | None, offboard: str,
+    path: Path, *, seed: int | None, settings: list[str], autopilot: str | None, binary: Path | None, offboard: str,
     ground: str, lidar: str, speed: float, duration_s: float | None, metadata: Path | None, as_json: bool,
 ) -> int:  # fmt: skip
     """Exit code: 0 stopped as asked."""
     mission = load_mission(path, settings, seed=seed)
     if mission.sim is None:
         raise ConfigError(f"{mission.path}: world: is missing: there is nothing to emulate")
+    autopilot = autopilot or mission.sim.autopilot.kind
     console = Console(stderr=True)
     stop = _Stop()
     lidar_link = open_link("--lidar", lidar)

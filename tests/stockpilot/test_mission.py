@@ -238,3 +238,17 @@ def test_mission_without_a_world_is_for_flying_only(tmp_path: Path) -> None:
     path = tmp_path / "real.yaml"
     path.write_text("name: real\nnavigator: {height_m: 5}\n", encoding="utf-8")
     assert load_mission(path).sim is None
+
+
+@pytest.mark.parametrize("command", ["run", "sim"])
+def test_the_mission_says_which_flight_controller_flies(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """px4 asks for its binary; the emulated one would not look at that path."""
+    silo = str(MISSIONS / "silo.yaml")
+    arguments = [command, silo, "--set", "autopilot.kind=px4", "--autopilot-binary", str(tmp_path / "none")]
+    monkeypatch.setattr("sys.argv", ["stockpilot", *arguments, *(["--out", str(tmp_path)] if command == "run" else [])])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 2
+    assert "not an executable file; give the SITL binary" in capsys.readouterr().err
