@@ -45,7 +45,6 @@ def sim_command(
     autopilot = autopilot or mission.sim.autopilot.kind
     console = Console(stderr=True)
     stop = _Stop()
-    lidar_link = open_link("--lidar", lidar)
     links: dict[str, UdpLink] = {}
     endpoint: MavlinkEndpoint | None = None
     if autopilot == "emulated":
@@ -63,6 +62,7 @@ def sim_command(
         simulation, closing = simulation_for(mission.sim, autopilot, binary)
         close = closing.close
         offboard, ground = OFFBOARD_URL, GROUND_URL  # its own sockets
+    lidar_link = open_link("--lidar", lidar)
     if metadata is not None:
         metadata.write_text(simulation.lidar_metadata_json(), encoding="utf-8")
     console.print(
