@@ -33,8 +33,9 @@ from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
 from companion.odometry.keyframes import PlacedScan, WaitingScans
 from companion.odometry.level import AllReturns, Leveller, ReturnNoise, block_means, wall_layer
-from companion.odometry.ranges import layer_ranges, wall_ranges
+from companion.odometry.ranges import SCANS, layer_ranges, wall_ranges
 from companion.odometry.relocalise import relocalise
+from companion.odometry.specks import without_specks
 from companion.odometry.standstill import Standstill
 from companion.odometry.wall_map import Registration, WallMap
 
@@ -86,7 +87,7 @@ class Odometry:
         self._is_released = False  # the filter, from standing at the origin
         self._standing_scans = 0
         self._waiting = WaitingScans()
-        self._layers: deque[Array] = deque(maxlen=3)  # of the last scans, newest first
+        self._layers: deque[Array] = deque(maxlen=SCANS)  # of the last scans, newest first
         self._sigma_range_m = 0.1
         self._return_noise = ReturnNoise()  # of single returns: the registration's also holds what walls are rough by
         self._accepted = 0
@@ -147,6 +148,7 @@ class Odometry:
         vertical = kalman.start_vertical(scan.t_ns) if old is None else kalman.carry_vertical(old.vertical, scan.t_ns)
         velocity = kalman.velocity_level(planar, vertical)
         levelled, every = self._leveller.level(scan, history, velocity, self.height.tilt_offset_rad)
+        levelled = without_specks(scan, levelled)
         row = scan.geometry.horizontal_row
         layer = wall_layer(levelled, row, self.height.floor_below_m(float(vertical.x[0])))
         near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m

@@ -15,12 +15,17 @@ from companion.odometry.level_kernels import middle_of
 
 HALF_WIDTH_RAD = math.radians(4.0)  # beams about the bearing of eq. 4 and 5: the median of a dozen instead of one
 MIN_BEAMS = 3
+SCANS = 4  # that are compared: this one and those before it
 NEAR_M = 4.0  # nearer than this a return that stands alone may be a speck of dust, and would stop the vehicle
 TOGETHER_M = 0.4  # of range between returns of one thing: three sigma of the noise
 BESIDE_COLUMNS = 3  # how far off its neighbours may be
 BEFORE_COLUMNS = 2  # how far off itself one scan before: 14 deg/s at 10 Hz
-MOST_SPECKS_RATIO = 0.035  # of the layer's columns: in thicker dust every return counts, and stops the vehicle
 COMPANIONS = 2  # neighbours that make a thing of a return: a hand's breadth at two metres
+HAZE_RATIO = 0.035  # of the layer's columns are specks: in thicker dust specks come together by chance more often, so
+THICK_BESIDE_COLUMNS = 4  # a thing needs more
+THICK_COMPANIONS = 3  # neighbours, or has to be there
+THICK_BEFORE_COLUMNS = 1  # so near to itself, and a scan longer
+MOST_SPECKS_RATIO = 0.068  # of the layer's columns: in still thicker dust every return counts, and stops the vehicle
 
 
 def layer_ranges(scan: LidarScan) -> Array:
@@ -38,15 +43,15 @@ def wall_ranges(
 ) -> WallRanges:
     """Distances from the body's centre in the horizontal layer.
 
-    layers: `layer_ranges` of this scan and the two before it, newest first; fewer: every return counts. A near return
-    counts where it has neighbours, or where it came in each of the three; one that stands alone is a speck of dust, and
-    nobody knows what lies behind it.
+    layers: `layer_ranges` of this scan and the three before it, newest first; fewer: every return counts. A near return
+    counts where it has neighbours, or where it came in the two scans before too (three in thick dust); one that stands
+    alone is a speck of dust, and nobody knows what lies behind it.
 
     The paper counts beams from behind, clockwise: index r/2 looks ahead and r/4... to the right with its sensor's
     order reversed; here both are found by bearing, so that the order of the beams does not matter (docs/paper.md).
     """
-    is_comparable = len(layers) == 3 and len({layer.shape for layer in layers}) == 1
-    is_speck = _specks(*layers) if is_comparable else np.zeros(len(scan.column_valid), np.bool_)
+    is_comparable = len(layers) == SCANS and len({layer.shape for layer in layers}) == 1
+    is_speck = _specks(np.stack(layers)) if is_comparable else np.zeros(len(scan.column_valid), np.bool_)
     front, right, ranges, is_seen = _look_around(
         every.points_level,
         every.range_m,
@@ -118,23 +123,35 @@ def _look_around(
 
 
 @kernel
-def _specks(layer: Array, one: Array, two: Array) -> NDArray[np.bool_]:
-    """(columns,) near returns that stand alone. layer, one, two: (columns,) ranges of this scan and the two before."""
-    columns = len(layer)
-    is_speck = np.zeros(columns, np.bool_)
-    for c in range(columns):
-        reach = layer[c]
-        if reach >= NEAR_M:
-            continue
-        beside = -1  # itself
-        for k in range(-BESIDE_COLUMNS, BESIDE_COLUMNS + 1):
-            beside += int(abs(layer[(c + k) % columns] - reach) <= TOGETHER_M)
-        if beside < COMPANIONS:
-            was_there = _was_there(one, c, reach, BEFORE_COLUMNS) and _was_there(two, c, reach, 2 * BEFORE_COLUMNS)
-            is_speck[c] = not was_there
+def _specks(layers: Array) -> NDArray[np.bool_]:
+    """(columns,) near returns that stand alone. layers: (4, columns) ranges of this scan and those before it."""
+    columns = layers.shape[1]
+    is_speck = _alone(layers, BESIDE_COLUMNS, COMPANIONS, BEFORE_COLUMNS, 2)
+    if np.sum(is_speck) > HAZE_RATIO * columns:
+        is_speck = _alone(layers, THICK_BESIDE_COLUMNS, THICK_COMPANIONS, THICK_BEFORE_COLUMNS, 3)
     if np.sum(is_speck) > MOST_SPECKS_RATIO * columns:
         is_speck[:] = False
     return is_speck
+
+
+@kernel
+def _alone(layers: Array, beside_columns: int, companions: int, before_columns: int, scans: int) -> NDArray[np.bool_]:
+    """(columns,) near returns with fewer companions in their scan, and not there in each of so many scans before."""
+    columns = layers.shape[1]
+    is_alone = np.zeros(columns, np.bool_)
+    for c in range(columns):
+        reach = layers[0, c]
+        if reach >= NEAR_M:
+            continue
+        beside = -1  # itself
+        for k in range(-beside_columns, beside_columns + 1):
+            beside += int(abs(layers[0, (c + k) % columns] - reach) <= TOGETHER_M)
+        if beside < companions:
+            was_there = True
+            for n in range(1, scans + 1):
+                was_there = was_there and _was_there(layers[n], c, reach, n * before_columns)
+            is_alone[c] = not was_there
+    return is_alone
 
 
 @kernel

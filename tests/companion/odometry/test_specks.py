@@ -27,7 +27,7 @@ def with_returns(scan: LidarScan, returns: dict[int, float]) -> LidarScan:
 
 def seen(scan: LidarScan, history: AttitudeHistory, before: tuple[LidarScan, LidarScan]) -> WallRanges:
     _, every = Leveller(LidarConfig()).level(scan, history, np.zeros(3))
-    return wall_ranges(scan, every, np.eye(3), 0.5, [layer_ranges(each) for each in (scan, *before)])
+    return wall_ranges(scan, every, np.eye(3), 0.5, [layer_ranges(each) for each in (scan, *before, before[-1])])
 
 
 def bearing(column: int, scan: LidarScan) -> int:
