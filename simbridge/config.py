@@ -154,7 +154,7 @@ class ImuConfig(Section):
         (0.0, 0.0, 0.0), description="of the sensor in the airframe: becomes an error of the attitude"
     )
     vibration_mps2: NonNegative = Field(
-        0.0, le=50, description="RMS of accelerometer noise from the rotors at full thrust"
+        0.0, le=50, description="RMS of the accelerometer's shaking at the rotors' speed, at full thrust"
     )
     vibration_dps: NonNegative = Field(0.0, le=200, description="the same on the gyro")
 

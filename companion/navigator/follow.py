@@ -1,10 +1,15 @@
 """Whether the vehicle does what it is told. An autopilot that no longer gets our setpoints may say nothing: ArduCopter
 stops after 3 s and holds in GUIDED (ARDUPILOT.md). Only what it does tells: so what was asked is compared with what was
-done."""
+done.
+
+Gusts carry a vehicle that follows off its way too. They do not carry it ever farther, as it flies against them: so where
+the last half minute has shown much of that, a longer way is looked at before anything is said.
+"""
 
 from __future__ import annotations
 
 import math
+import statistics
 from collections import deque
 from dataclasses import dataclass
 
@@ -12,9 +17,14 @@ from companion.geometry import wrap_angle, yaw_from_quat
 from companion.messages import OdometryEstimate, Setpoint
 
 WINDOW_NS = 3_000_000_000
+WINDOWS_NS = (WINDOW_NS, 5_000_000_000, 8_000_000_000, 12_000_000_000)  # the longest is judged whatever gusts do
 LASTING_NS = 1_500_000_000  # a start or a change of direction is over by then
 MAX_STEP_S = 0.3  # between two setpoints; longer is a pause, in which nothing was asked
-LEAST_M = 0.6  # asked within the window, to be judged at all: 0.2 m/s
+LEAST_MPS = 0.2  # asked on the mean of a window, to be judged at all
+GUSTS_RATIO = 6.0  # asked within a window over what the vehicle usually was off after three seconds, likewise
+USUAL_EVERY_NS = 500_000_000
+USUAL_COUNT = 60  # half a minute: a vehicle that has just stopped following does not yet show in the median
+USUAL_AT_FIRST = (0.3,) * 20  # m; until ten seconds have told
 LEAST_RAD = math.radians(20.0)
 DONE_RATIO = 0.25
 
@@ -29,10 +39,13 @@ class _Trace:
 
 
 class FollowWatch:
-    """Horizontal motion and turning, asked and done, over the last three seconds."""
+    """Horizontal motion and turning, asked and done, over the last three seconds; over more of them in gusts."""
 
     def __init__(self) -> None:
         self._traces: deque[_Trace] = deque()
+        # What done was off asked over WINDOW_NS, time after time.
+        self._off_m: deque[float] = deque(USUAL_AT_FIRST, maxlen=USUAL_COUNT)
+        self._off_ns = 0
         self._since_ns: int | None = None
         self._reset_counter = 0
 
@@ -74,18 +87,36 @@ class FollowWatch:
             asked = (ax + vx * dt, ay + vy * dt, turn + sent.yaw_rate_radps * dt)
             yaw = last.done[2] + wrap_angle(yaw - last.done[2])
         self._traces.append(_Trace(t_ns, asked, (x, y, yaw)))
-        while t_ns - self._traces[0].t_ns > WINDOW_NS:
+        while t_ns - self._traces[0].t_ns > WINDOWS_NS[-1]:
             self._traces.popleft()
+        if t_ns - self._off_ns >= USUAL_EVERY_NS and t_ns - self._traces[0].t_ns >= WINDOW_NS:
+            (ax, ay, _), (dx, dy, _) = self._within(WINDOW_NS)
+            self._off_m.append(math.hypot(dx - ax, dy - ay))
+            self._off_ns = t_ns
+
+    def _within(self, window_ns: int) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Asked and done within the last so many ns, or since it began to be watched."""
+        end = self._traces[-1]
+        begin = next(trace for trace in self._traces if end.t_ns - trace.t_ns <= window_ns)
+        ax, ay, asked_turn = (after - before for before, after in zip(begin.asked, end.asked, strict=True))
+        dx, dy, turned = (after - before for before, after in zip(begin.done, end.done, strict=True))
+        return (ax, ay, asked_turn), (dx, dy, turned)
 
     def _unfollowed(self) -> str:
         if len(self._traces) < 2:
             return ""
-        begin, end = self._traces[0], self._traces[-1]
-        ax, ay, asked_turn = (after - before for before, after in zip(begin.asked, end.asked, strict=True))
-        dx, dy, turned = (after - before for before, after in zip(begin.done, end.done, strict=True))
-        asked_m = math.hypot(ax, ay)
-        if asked_m >= LEAST_M and (ax * dx + ay * dy) / asked_m < DONE_RATIO * asked_m:
-            return f"asked to move {asked_m:.1f} m, it moved {(ax * dx + ay * dy) / asked_m:.1f} m"
+        usual_m = statistics.median(self._off_m)
+        for window_ns in WINDOWS_NS:
+            (ax, ay, _), (dx, dy, _) = self._within(window_ns)
+            asked_m = math.hypot(ax, ay)
+            if asked_m < LEAST_MPS * window_ns * 1e-9:
+                continue
+            if asked_m >= GUSTS_RATIO * usual_m or window_ns == WINDOWS_NS[-1]:
+                done_m = (ax * dx + ay * dy) / asked_m
+                if done_m < DONE_RATIO * asked_m:
+                    return f"asked to move {asked_m:.1f} m, it moved {done_m:.1f} m"
+                break
+        (_, _, asked_turn), (_, _, turned) = self._within(WINDOW_NS)
         if abs(asked_turn) >= LEAST_RAD and turned * math.copysign(1.0, asked_turn) < DONE_RATIO * abs(asked_turn):
             return f"asked to turn {math.degrees(asked_turn):.0f} deg, it turned {math.degrees(turned):.0f} deg"
         return ""

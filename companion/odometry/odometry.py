@@ -50,6 +50,7 @@ WAIT_FOR_FIRST_SCANS = 5
 MIN_VALID_COLUMNS_FIRST_RATIO = 0.75  # the first scan makes the map: one that was joined in mid-turn would ruin it
 SUDDEN_LOSS = 0.15  # share of the layer's points that lose their wall at once
 MIN_JUMP_M = 0.2
+MOST_LOW_SCANS = 100  # a take-off is over by then: what stays low was not taking off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +96,7 @@ class Odometry:
         self._is_weak, self._is_lost = False, False  # along an axis: not held by walls; nor known well enough to map
         self._held_by_walls = np.zeros((2, 2))  # translation's information while weak, over some scans
         self._rejected_in_row = 0
+        self._low_scans = 0  # since it no longer stands, until it has been higher than LOW_M
         self._keyframe_t_ns = 0
         self._keyframe_z_m = 0.0
         self._base_variance = np.zeros(3)
@@ -310,12 +312,15 @@ class Odometry:
     ) -> bool:
         """Whether walls went missing all at once and are found again from a pose elsewhere.
 
-        Walls along the way of motion fit as well after a jump along them: only those across it are missed.
+        Walls along the way of motion fit as well after a jump along them: only those across it are missed. Until it has
+        risen the foot of a pile passes for a wall, and a tilted layer meets it higher and farther off: no place to go to.
         """
+        if not self._standstill.is_standing:
+            self._low_scans = MOST_LOW_SCANS if z_m > LOW_M else self._low_scans + 1
         share = registration.inliers / max(len(layer), 1)
         lost = self._usual_share - share
         self._usual_share += 0.1 * (share - self._usual_share)
-        if lost < SUDDEN_LOSS or self._standstill.is_standing:
+        if lost < SUDDEN_LOSS or self._standstill.is_standing or self._low_scans < MOST_LOW_SCANS:
             return False
         found = relocalise(self.walls, layer, guess, covariance, z_m, self._sigma_range_m)
         if found is None or found.inliers < registration.inliers + SUDDEN_LOSS * len(layer):
