@@ -20,6 +20,7 @@ from companion.errors import ConfigError, FileFormatError
 from companion.flight import Flight
 from companion.messages import OdometryEstimate, VolumeReport
 from companion.odometry import ScanResult
+from companion.recording import ahead
 from companion.recording.manifest import require_unaltered
 from companion.recording.replay import Replay, TopicDifference, compare
 from companion.recording.run_files import RunRecording, read_run, recording_path
@@ -70,7 +71,11 @@ def replay_run(path: Path, settings: Sequence[str] = (), *, keep_messages: bool 
     replay = Replay(flight, keep_messages=keep_messages, on_scan=take)
     gc.freeze()  # the inputs stay: to look through them again and again for garbage takes a tenth of the time
     began = time.perf_counter()
-    replay.run(recording.inputs)
+    if ahead.is_worthwhile():
+        with ahead.registering(flight, recording.inputs) as replay.registered:
+            replay.run(recording.inputs)
+    else:
+        replay.run(recording.inputs)
     return Replayed(recording, config, replay, estimates, time.perf_counter() - began)
 
 

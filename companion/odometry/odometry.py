@@ -136,6 +136,22 @@ class Odometry:
         moment does not depend on when a thread was done, and replay repeats it."""
         self._published = self._snapshot
 
+    @property
+    def t_attitude_ns(self) -> int:
+        """Of the newest attitude that came; 0 before the first."""
+        history = self._attitude.history
+        return 0 if history is None else int(history.t_ns[-1])
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """The state after the scan last processed."""
+        return self._snapshot
+
+    def adopt(self, snapshot: Snapshot | None) -> None:
+        """A scan was processed elsewhere, by an odometry that heard the same: its state is ours. Only `publish` and
+        `predict` may follow; the map stays there."""
+        self._snapshot = snapshot
+
     def _process(
         self, scan: LidarScan, history: AttitudeHistory | None, samples: list[RangefinderSample]
     ) -> ScanResult | None:

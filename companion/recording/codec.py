@@ -30,7 +30,10 @@ _NAMESPACE = vars(messages)
 
 def encode(message: object) -> bytes:
     """JSON of a message: its fields by name, in their order."""
-    return _dump(_encode_fields(message))
+    try:
+        return _dump_finite(_fields_of(message)).encode()
+    except (TypeError, ValueError):  # an inf or nan somewhere, or keys that are no strings: rare, and spelt out
+        return _dump(_encode_fields(message))
 
 
 def encode_value(value: object) -> bytes:
@@ -62,6 +65,23 @@ def _dump(value: object) -> bytes:
 @functools.cache
 def _field_names(kind: Any) -> tuple[str, ...]:
     return tuple(f.name for f in dataclasses.fields(kind))
+
+
+def _fields_of(message: Any) -> dict[str, Any]:
+    return {name: getattr(message, name) for name in _field_names(message.__class__)}
+
+
+def _unlisted(value: Any) -> Any:
+    """What JSON's encoder asks for: the same as `_value` gives, but arrays are not looked through for inf and nan, which
+    it refuses itself."""
+    if type(value) is np.ndarray and value.size <= MAX_LISTED and value.size > 0:
+        return value.tolist()
+    return _fields_of(value) if dataclasses.is_dataclass(value) else _value(value)
+
+
+_dump_finite = json.JSONEncoder(
+    separators=(",", ":"), allow_nan=False, check_circular=False, default=_unlisted
+).encode
 
 
 def _encode_fields(message: Any) -> dict[str, Any]:

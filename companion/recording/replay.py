@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from companion import topics
@@ -17,6 +17,7 @@ from companion.flight import Flight
 from companion.messages import LidarScan, OperatorCommand, OperatorCommandKind
 from companion.odometry import ScanResult
 from companion.recording import channels, codec
+from companion.recording.ahead import Finished, Registered, Told
 from companion.recording.run_types import Input
 
 SCAN_QUEUE = topics.SCAN.queue
@@ -27,11 +28,13 @@ class Replay:
     """Feeds recorded inputs to `flight`. What comes out is kept: frames, messages by topic (encoded), scan results.
 
     keep_messages: encode and keep every message, for comparison; costs time.
+    registered: what each accepted scan gave, where another process registers them; the flight's odometry then has no map.
     """
 
     flight: Flight
     keep_messages: bool = True
     on_scan: Callable[[ScanResult], None] | None = None
+    registered: Iterator[Told] | None = None
     frames: list[tuple[int, bytes]] = field(init=False, default_factory=list)
     messages: dict[str, list[tuple[int, bytes]]] = field(init=False, default_factory=dict)
     first_ns: int | None = field(init=False, default=None)
@@ -56,6 +59,11 @@ class Replay:
     def run(self, inputs: Iterable[Input]) -> None:
         for item in inputs:
             self.feed(item)
+        if self.registered is not None:
+            finished = next(self.registered)
+            assert isinstance(finished, Finished)
+            self.unmatched += finished.unmatched
+            self.flight.decoder.dropped.update(finished.dropped)
 
     def feed(self, item: Input) -> None:
         """One recorded call."""
@@ -64,6 +72,8 @@ class Replay:
         self.last_ns = t_ns
         self._is_feeding = item.kind
         if item.kind == "lidar":
+            if self.registered is not None:
+                return
             self._scans.extend(flight.on_lidar_packet(item.data, t_ns, item.source))
             return
         if item.kind == "mavlink":
@@ -81,16 +91,36 @@ class Replay:
         self.frames += [(t_ns, frame) for frame in flight.take_output()]
 
     def _begin(self, t_ns: int) -> None:
+        if self.registered is not None:
+            return
         if self._scans:
             self._jobs.append(self.flight.begin_scan(self._scans.popleft(), t_ns))
         else:
             self.unmatched += 1
 
     def _accept(self, t_ns: int) -> None:
-        if not self._jobs:
+        if self.registered is not None:
+            told = next(self.registered)
+            if isinstance(told, Registered):
+                self._take_in(self._adopt(told), t_ns)
+            else:
+                self.unmatched += 1
+        elif self._jobs:
+            self._take_in(self._jobs.popleft()(), t_ns)
+        else:
             self.unmatched += 1
-            return
-        result = self._jobs.popleft()()
+
+    def _adopt(self, told: Registered) -> ScanResult | None:
+        odometry = self.flight.odometry
+        if told.t_attitude_ns != odometry.t_attitude_ns:
+            raise RuntimeError(
+                f"replay: the attitude at {odometry.t_attitude_ns} ns is another, {told.t_attitude_ns} ns, where scans are "
+                "registered ahead: they depend on more than was thought"
+            )
+        odometry.adopt(told.snapshot)
+        return told.result
+
+    def _take_in(self, result: ScanResult | None, t_ns: int) -> None:
         belongs = self.flight.accept_scan(result, t_ns)
         if result is not None:
             if belongs:
