@@ -79,9 +79,7 @@ def _unlisted(value: Any) -> Any:
     return _fields_of(value) if dataclasses.is_dataclass(value) else _value(value)
 
 
-_dump_finite = json.JSONEncoder(
-    separators=(",", ":"), allow_nan=False, check_circular=False, default=_unlisted
-).encode
+_dump_finite = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False, default=_unlisted).encode
 
 
 def _encode_fields(message: Any) -> dict[str, Any]:

@@ -78,7 +78,9 @@ def test_until_two_scans_came_before_every_return_counts(clear: tuple[LidarScan,
     assert wall_ranges(dusty, every, np.eye(3), 0.5).ranges_m[bearing(100, scan)] < 2.0
 
 
-@pytest.mark.parametrize(("visibility_m", "least", "most"), [(200.0, 0.0, 0.05), (100.0, 0.0, 0.15), (60.0, 0.0, 0.3), (20.0, 0.95, 1.0)])
+@pytest.mark.parametrize(
+    ("visibility_m", "least", "most"), [(200.0, 0.0, 0.05), (100.0, 0.0, 0.15), (60.0, 0.0, 0.3), (20.0, 0.95, 1.0)]
+)
 def test_haze_is_flown_through_and_thick_dust_stops(
     clear: tuple[LidarScan, AttitudeHistory], visibility_m: float, least: float, most: float
 ) -> None:
