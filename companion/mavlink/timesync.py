@@ -37,6 +37,7 @@ class Timesync:
         self._jumps = 0
         self._asked: deque[int] = deque(maxlen=_WINDOW)
         self._exchanges: deque[_Exchange] = deque(maxlen=_WINDOW)
+        self._quickest: _Exchange | None = None  # of them
         self._coarse_ns: int | None = None
 
     def ask(self, t_ns: int) -> tuple[int, int]:
@@ -71,6 +72,7 @@ class Timesync:
         self._jumps = 0
         self.good += 1
         self._exchanges.append(exchange)
+        self._quickest = min(self._exchanges, key=lambda e: e.round_trip_ns)
 
     def note_arrival(self, t_autopilot_ns: int, t_ns: int) -> None:
         """A stamped message came: until exchanges are there, the quickest arrival so far gives a rough offset."""
@@ -81,9 +83,7 @@ class Timesync:
     @property
     def offset_ns(self) -> int | None:
         """From the exchange with the shortest round trip of the last 32; before any, the rough one; None: unknown."""
-        if not self._exchanges:
-            return self._coarse_ns
-        return min(self._exchanges, key=lambda e: e.round_trip_ns).offset_ns
+        return self._coarse_ns if self._quickest is None else self._quickest.offset_ns
 
     def to_companion(self, t_autopilot_ns: int, t_arrival_ns: int) -> int:
         """A time of the autopilot's clock in ours; never later than its arrival."""

@@ -76,29 +76,32 @@ class AttitudeBuffer:
     def __init__(self) -> None:
         self.history: AttitudeHistory | None = None
         self._t_ns, self._samples, self._end = np.empty(STORE, np.int64), np.empty((STORE, 4)), 0
+        self.newest_ns, self._newest = 0, (0.0, 0.0, 0.0, 0.0)
         self.dropped = 0
 
     def add(self, sample: AttitudeSample) -> bool:
         """False when the sample is not finite, not a rotation, or not newer than the last (counted)."""
         q, rate = np.asarray(sample.q_ref_body_wxyz, float), np.asarray(sample.rate_body_radps, float)
-        if q.shape != (4,) or rate.shape != (3,) or not all(map(math.isfinite, (*q.tolist(), *rate.tolist()))):
+        if q.shape != (4,) or rate.shape != (3,):
             self.dropped += 1
             return False
         w, x, y, z = q.tolist()
+        rate_x, rate_y, rate_z = rate.tolist()
         norm = w * w + x * x + y * y + z * z
         old = self.history
-        if not 0.81 < norm < 1.21 or (old is not None and sample.t_ns <= old.t_ns[-1]):
+        is_sound = 0.81 < norm < 1.21 and math.isfinite(rate_x + rate_y + rate_z)
+        if not is_sound or (old is not None and sample.t_ns <= self.newest_ns):
             self.dropped += 1
             return False
         q = q / math.sqrt(norm)
         roll, pitch, _ = rpy_from_quat(q)
-        _, rate_y, rate_z = rate.tolist()
         yaw_rate = (rate_y * math.sin(roll) + rate_z * math.cos(roll)) / max(math.cos(pitch), 0.1)
         row = roll, pitch, 0.0, yaw_rate
         if old is not None:
-            *_, yaw, rate_before = old.values[-1].tolist()
-            dt_s = (sample.t_ns - int(old.t_ns[-1])) * 1e-9
+            _, _, yaw, rate_before = self._newest
+            dt_s = (sample.t_ns - self.newest_ns) * 1e-9
             row = roll, pitch, yaw + 0.5 * (yaw_rate + rate_before) * dt_s, yaw_rate
+        self.newest_ns, self._newest = sample.t_ns, row
         self._append(sample.t_ns, row, q, rate)
         return True
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.jit import kernel
 from companion.messages import Array
 
 MARGIN_CELLS = 64  # grown by at least this much at a time
@@ -21,10 +23,21 @@ class Growth(NamedTuple):
     origin: Array
 
 
+@kernel
+def _cells(points: Array, origin: Array, cell_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(2,) the lowest and the highest x and y of points (N, 2), N > 0, in cells from the origin."""
+    low, high = np.empty(2, np.int64), np.empty(2, np.int64)
+    for k in range(2):
+        least = most = points[0, k]
+        for i in range(1, points.shape[0]):
+            least, most = min(least, points[i, k]), max(most, points[i, k])
+        low[k], high[k] = math.floor((least - origin[k]) / cell_m), math.floor((most - origin[k]) / cell_m)
+    return low, high
+
+
 def growth(shape: tuple[int, ...], origin: Array, cell_m: float, points: Array) -> Growth | None:
     """How a grid (ny, nx) must grow so that points (N, 2) lie within; None: not at all, or beyond MAX_CELLS."""
-    low: NDArray[np.int64] = np.floor((points.min(axis=0) - origin) / cell_m).astype(np.int64)
-    high: NDArray[np.int64] = np.floor((points.max(axis=0) - origin) / cell_m).astype(np.int64)
+    low, high = _cells(points, origin, cell_m)
     ny, nx = shape
     if low[0] >= 0 and low[1] >= 0 and high[0] < nx and high[1] < ny:
         return None

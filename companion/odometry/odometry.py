@@ -139,8 +139,7 @@ class Odometry:
     @property
     def t_attitude_ns(self) -> int:
         """Of the newest attitude that came; 0 before the first."""
-        history = self._attitude.history
-        return 0 if history is None else int(history.t_ns[-1])
+        return self._attitude.newest_ns
 
     @property
     def snapshot(self) -> Snapshot | None:

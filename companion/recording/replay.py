@@ -118,7 +118,7 @@ class Replay:
                 "registered ahead: they depend on more than was thought"
             )
         odometry.adopt(told.snapshot)
-        return told.result
+        return None if told.found is None else told.found.result()
 
     def _take_in(self, result: ScanResult | None, t_ns: int) -> None:
         belongs = self.flight.accept_scan(result, t_ns)
