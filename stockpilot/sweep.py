@@ -131,7 +131,8 @@ def sweep_command(
         Path | None, typer.Option(help="fill this document's block of the sweep, e.g. docs/results.md")
     ] = None,
     limit: Annotated[
-        int | None, typer.Option(min=1, help="fly so many of the missing ones now, spread evenly over the sweep")
+        int | None,
+        typer.Option(min=0, help="fly so many of the missing ones now, spread evenly; 0: only tell what is there"),
     ] = None,
     list_only: Annotated[bool, typer.Option("--list", help="name the flights, fly none")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON on stdout")] = False,
