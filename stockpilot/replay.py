@@ -71,10 +71,9 @@ def replay_run(path: Path, settings: Sequence[str] = (), *, keep_messages: bool 
     replay = Replay(flight, keep_messages=keep_messages, on_scan=take)
     gc.freeze()  # the inputs stay: to look through them again and again for garbage takes a tenth of the time
     began = time.perf_counter()
-    if ahead.is_worthwhile():
-        with ahead.registering(flight, recording.inputs) as replay.registered:
-            replay.run(recording.inputs)
-    else:
+    with contextlib.ExitStack() as stack:
+        if ahead.is_worthwhile():
+            replay.scans = stack.enter_context(ahead.registering(flight, recording.inputs))
         replay.run(recording.inputs)
     return Replayed(recording, config, replay, estimates, time.perf_counter() - began)
 

@@ -11,19 +11,19 @@ import fcntl
 import multiprocessing
 import os
 import pickle
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import NamedTuple
 
 import numpy as np
 
-from companion import topics
 from companion.flight import Flight
-from companion.messages import LevelledScan, LidarScan, OdometryEstimate, WallRanges
+from companion.messages import LevelledScan, OdometryEstimate, WallRanges
 from companion.odometry import ScanResult
 from companion.odometry.estimate import Snapshot
 from companion.recording.run_types import Input
+from companion.recording.scans import Accepted, ScansHere
 
 PIPE_BYTES = 1 << 20  # what Linux allows anybody: by how much the one may be ahead of the other
 _NONE = np.zeros(0, np.int64)
@@ -82,10 +82,43 @@ def is_worthwhile() -> bool:
     return hasattr(os, "fork") and len(os.sched_getaffinity(0)) > 1
 
 
+@dataclass(slots=True)
+class ScansAhead:
+    """A ScanSource: `told` brings what the other process registered. The odometry of `flight` then has no map."""
+
+    flight: Flight
+    told: Iterator[Told]
+    unmatched: int = 0
+
+    def lidar(self, item: Input) -> None:
+        """The other process has it."""
+
+    def begin(self, t_ns: int) -> None:
+        """The other process does."""
+
+    def accept(self) -> Accepted | None:
+        told = next(self.told)
+        if not isinstance(told, Registered):
+            return None
+        odometry = self.flight.odometry
+        if told.t_attitude_ns != odometry.t_attitude_ns:
+            raise RuntimeError(
+                f"replay: the attitude at {odometry.t_attitude_ns} ns is another, {told.t_attitude_ns} ns, where scans are "
+                "registered ahead: they depend on more than was thought"
+            )
+        odometry.adopt(told.snapshot)
+        return Accepted(None if told.found is None else told.found.result())
+
+    def finish(self) -> None:
+        finished = next(self.told)
+        assert isinstance(finished, Finished)
+        self.unmatched = finished.unmatched
+        self.flight.decoder.dropped.update(finished.dropped)
+
+
 @contextlib.contextmanager
-def registering(flight: Flight, inputs: Sequence[Input]) -> Iterator[Iterator[Told]]:
-    """Gives an iterator over what the calls give: one for each accept, then Finished. flight: as before the first call;
-    it is not changed, the other process works with a copy."""
+def registering(flight: Flight, inputs: Sequence[Input]) -> Iterator[ScansAhead]:
+    """flight: as before the first call; the other process works with a copy of it."""
     ours, theirs = multiprocessing.Pipe(duplex=False)
     with contextlib.suppress(OSError):
         fcntl.fcntl(theirs.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
@@ -93,7 +126,7 @@ def registering(flight: Flight, inputs: Sequence[Input]) -> Iterator[Iterator[To
     process.start()
     theirs.close()
     try:
-        yield _received(ours)
+        yield ScansAhead(flight, _received(ours))
     finally:
         ours.close()
         process.terminate()
@@ -113,24 +146,20 @@ def _work(flight: Flight, inputs: Sequence[Input], theirs: Connection) -> None:
 
 def register(flight: Flight, inputs: Sequence[Input], tell: Callable[[Told], None]) -> None:
     """The calls that scans depend on: all but what the beats of estimates and setpoints do."""
-    scans: deque[LidarScan] = deque(maxlen=topics.SCAN.queue)
-    jobs: deque[Callable[[], ScanResult | None]] = deque()
-    unmatched = 0
-    for kind, t_ns, data, source in inputs:
-        if kind == "lidar":
-            scans.extend(flight.on_lidar_packet(data, t_ns, source))
-        elif kind == "mavlink":
-            flight.on_mavlink(data, t_ns, source)
-        elif kind == "poll":
-            flight.session.poll(t_ns)
-        elif kind == "begin":
-            if scans:
-                jobs.append(flight.begin_scan(scans.popleft(), t_ns))
-            else:
-                unmatched += 1
-        elif kind == "accept":
-            tell(_accept(flight, jobs.popleft()(), t_ns) if jobs else None)
-    tell(Finished(unmatched, flight.decoder.dropped))
+    scans = ScansHere(flight)
+    for item in inputs:
+        if item.kind == "lidar":
+            scans.lidar(item)
+        elif item.kind == "mavlink":
+            flight.on_mavlink(item.data, item.t_ns, item.source)
+        elif item.kind == "poll":
+            flight.session.poll(item.t_ns)
+        elif item.kind == "begin":
+            scans.begin(item.t_ns)
+        elif item.kind == "accept":
+            accepted = scans.accept()
+            tell(None if accepted is None else _accept(flight, accepted.result, item.t_ns))
+    tell(Finished(scans.unmatched, flight.decoder.dropped))
 
 
 def _accept(flight: Flight, result: ScanResult | None, t_ns: int) -> Registered:

@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from companion import topics
 from companion.errors import FileFormatError
 from companion.flight import Flight
-from companion.messages import LidarScan, OperatorCommand, OperatorCommandKind
+from companion.messages import OperatorCommand, OperatorCommandKind
 from companion.odometry import ScanResult
 from companion.recording import channels, codec
-from companion.recording.ahead import Finished, Registered, Told
 from companion.recording.run_types import Input
-
-SCAN_QUEUE = topics.SCAN.queue
+from companion.recording.scans import ScansHere, ScanSource
 
 
 @dataclass(slots=True)
@@ -28,29 +26,31 @@ class Replay:
     """Feeds recorded inputs to `flight`. What comes out is kept: frames, messages by topic (encoded), scan results.
 
     keep_messages: encode and keep every message, for comparison; costs time.
-    registered: what each accepted scan gave, where another process registers them; the flight's odometry then has no map.
+    scans: where the scans are registered, ScansAhead for another process; else here.
     """
 
     flight: Flight
     keep_messages: bool = True
     on_scan: Callable[[ScanResult], None] | None = None
-    registered: Iterator[Told] | None = None
+    scans: ScanSource = field(init=False)
     frames: list[tuple[int, bytes]] = field(init=False, default_factory=list)
     messages: dict[str, list[tuple[int, bytes]]] = field(init=False, default_factory=dict)
     first_ns: int | None = field(init=False, default=None)
     last_ns: int = field(init=False, default=0)
-    unmatched: int = field(
-        init=False, default=0
-    )  # begins or accepts without a scan: parts of the recording are missing
-    _scans: deque[LidarScan] = field(init=False, default_factory=lambda: deque(maxlen=SCAN_QUEUE))
-    _jobs: deque[Callable[[], ScanResult | None]] = field(init=False, default_factory=deque)
+    _unmatched: int = field(init=False, default=0)
     _nested: deque[bytes] = field(init=False, default_factory=deque)
     _is_feeding: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
+        self.scans = ScansHere(self.flight)
         self.flight.record = self._hear
         if self.keep_messages:
             self.flight.tap = self._keep
+
+    @property
+    def unmatched(self) -> int:
+        """Begins or accepts without a scan: parts of the recording are missing."""
+        return self._unmatched + self.scans.unmatched
 
     @property
     def duration_s(self) -> float:
@@ -59,11 +59,7 @@ class Replay:
     def run(self, inputs: Iterable[Input]) -> None:
         for item in inputs:
             self.feed(item)
-        if self.registered is not None:
-            finished = next(self.registered)
-            assert isinstance(finished, Finished)
-            self.unmatched += finished.unmatched
-            self.flight.decoder.dropped.update(finished.dropped)
+        self.scans.finish()
 
     def feed(self, item: Input) -> None:
         """One recorded call."""
@@ -72,16 +68,14 @@ class Replay:
         self.last_ns = t_ns
         self._is_feeding = item.kind
         if item.kind == "lidar":
-            if self.registered is not None:
-                return
-            self._scans.extend(flight.on_lidar_packet(item.data, t_ns, item.source))
+            self.scans.lidar(item)
             return
         if item.kind == "mavlink":
             flight.on_mavlink(item.data, t_ns, item.source)
         elif item.kind == "poll":
             flight.poll(t_ns)
         elif item.kind == "begin":
-            self._begin(t_ns)
+            self.scans.begin(t_ns)
         elif item.kind == "accept":
             self._accept(t_ns)
         elif item.kind == "operator":
@@ -90,37 +84,12 @@ class Replay:
             flight.on_told(item.data, t_ns)
         self.frames += [(t_ns, frame) for frame in flight.take_output()]
 
-    def _begin(self, t_ns: int) -> None:
-        if self.registered is not None:
-            return
-        if self._scans:
-            self._jobs.append(self.flight.begin_scan(self._scans.popleft(), t_ns))
-        else:
-            self.unmatched += 1
-
     def _accept(self, t_ns: int) -> None:
-        if self.registered is not None:
-            told = next(self.registered)
-            if isinstance(told, Registered):
-                self._take_in(self._adopt(told), t_ns)
-            else:
-                self.unmatched += 1
-        elif self._jobs:
-            self._take_in(self._jobs.popleft()(), t_ns)
-        else:
-            self.unmatched += 1
-
-    def _adopt(self, told: Registered) -> ScanResult | None:
-        odometry = self.flight.odometry
-        if told.t_attitude_ns != odometry.t_attitude_ns:
-            raise RuntimeError(
-                f"replay: the attitude at {odometry.t_attitude_ns} ns is another, {told.t_attitude_ns} ns, where scans are "
-                "registered ahead: they depend on more than was thought"
-            )
-        odometry.adopt(told.snapshot)
-        return None if told.found is None else told.found.result()
-
-    def _take_in(self, result: ScanResult | None, t_ns: int) -> None:
+        accepted = self.scans.accept()
+        if accepted is None:
+            self._unmatched += 1
+            return
+        result = accepted.result
         belongs = self.flight.accept_scan(result, t_ns)
         if result is not None:
             if belongs:

@@ -1,0 +1,77 @@
+"""Scans registered by a process ahead give what they give here: the same frames, messages, map and counts."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from pathlib import Path
+
+import pytest
+
+from companion.flight import Flight
+from companion.recording import ahead
+from companion.recording.replay import Replay
+from companion.recording.run_files import read_run
+from companion.recording.run_types import Input
+from stockpilot.replay import recorded_config
+from stockpilot.replay_edit import rebuild_scans
+
+CORNER = Path(__file__).resolve().parents[3] / "missions" / "replays" / "corner" / "recording.packed.xz"
+
+
+def recorded() -> tuple[Flight, list[Input]]:
+    recording = read_run(CORNER)
+    metadata = recording.attachments["lidar.json"].decode()
+    return Flight(config=recorded_config(recording), lidar_metadata_json=metadata), rebuild_scans(
+        recording.inputs, metadata
+    )
+
+
+LOST = {
+    "nothing": ("", 1),
+    "every ninth packet": ("lidar", 9),
+    "all packets": ("lidar", 1),
+    "every third begin": ("begin", 3),
+}
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_ahead_is_the_same_as_here(lost: str) -> None:
+    replays = []
+    for is_ahead in (False, True):
+        flight, inputs = recorded()
+        kind, every = LOST[lost]
+        count = itertools.count()
+        inputs = [item for item in inputs if item.kind != kind or next(count) % every]
+        replay = Replay(flight)
+        if is_ahead:
+            with ahead.registering(flight, inputs) as replay.scans:
+                replay.run(inputs)
+        else:
+            replay.run(inputs)
+        replays.append(replay)
+    here, other = replays
+    assert len(here.frames) > 100
+    assert other.frames == here.frames
+    assert other.messages == here.messages
+    assert other.unmatched == here.unmatched
+    assert (here.unmatched > 0) == (lost != "nothing")
+    assert other.flight.decoder.dropped == here.flight.decoder.dropped
+    assert other.flight.mapper.size == here.flight.mapper.size
+    assert (here.flight.mapper.size > 1000) == (lost != "all packets")
+
+
+def test_a_process_that_ends_early_is_told_and_not_taken_for_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight, inputs = recorded()
+    monkeypatch.setattr(ahead, "register", lambda *_: os._exit(3))
+    replay = Replay(flight)
+    with ahead.registering(flight, inputs) as replay.scans, pytest.raises(RuntimeError, match="ended early"):
+        replay.run(inputs)
+
+
+def test_attitude_that_differs_between_the_two_is_an_error() -> None:
+    flight, inputs = recorded()
+    first = next(n for n, item in enumerate(inputs) if item.kind == "mavlink")
+    replay = Replay(flight)
+    with ahead.registering(flight, inputs) as replay.scans, pytest.raises(RuntimeError, match="depend on more"):
+        replay.run(item for n, item in enumerate(inputs) if item.kind != "mavlink" or n == first)
