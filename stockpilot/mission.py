@@ -49,6 +49,11 @@ class Mission:
     def seed(self) -> int:
         return self.sim.seed if self.sim is not None else 0
 
+    @property
+    def autopilot(self) -> str:
+        """The flight controller that flies the emulated vehicle: emulated, px4 or ardupilot."""
+        return self.sim.autopilot.kind if self.sim is not None else "emulated"
+
     def resolved(self) -> dict[str, Any]:
         """Every key with its value, defaults included: enough to write the same mission again."""
         out: dict[str, Any] = {"name": self.name, "description": self.description}

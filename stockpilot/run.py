@@ -60,11 +60,6 @@ def emulated(cfg: SimConfig, links: tuple[str, ...] = (OFFBOARD,)) -> tuple[Simu
     return Simulation(cfg, controller), controller
 
 
-def flight_controller_of(mission: Mission) -> str:
-    """emulated, px4 or ardupilot, as the mission says."""
-    return mission.sim.autopilot.kind if mission.sim is not None else "emulated"
-
-
 def prepare(mission: Mission, *, autopilot: str = "emulated", binary: Path | None = None) -> Prepared:
     """Build the world, the flight controller and the companion. Raises: ConfigError: no world; no such autopilot."""
     if mission.sim is None:
@@ -116,7 +111,7 @@ def run_command(
     from stockpilot.leave import write_results
 
     mission = load_mission(path, settings, seed=seed)
-    autopilot = autopilot or flight_controller_of(mission)
+    autopilot = autopilot or mission.autopilot
     folder = out or Path("runs") / f"{mission.name}-{mission.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=True)

@@ -42,7 +42,7 @@ def sim_command(
     mission = load_mission(path, settings, seed=seed)
     if mission.sim is None:
         raise ConfigError(f"{mission.path}: world: is missing: there is nothing to emulate")
-    autopilot = autopilot or mission.sim.autopilot.kind
+    autopilot = autopilot or mission.autopilot
     console = Console(stderr=True)
     stop = _Stop()
     links: dict[str, UdpLink] = {}

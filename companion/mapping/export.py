@@ -6,15 +6,13 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import laspy
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.errors import FileFormatError
 from companion.mapping.ply import Columns, read_ply, write_ply
-from companion.messages import Array, PointMap
+from companion.messages import PointMap
 
 VLR_USER = "stockpilot"
 VLR_RECORD = 1
@@ -91,23 +89,15 @@ def _load_ply(path: Path) -> PointMap:
     points = np.column_stack([vertex[a] for a in "xyz"]).astype(np.float64)
     told = dict(c.split(" ", 1) for c in comments if " " in c)
     flown = elements.get("path", {})
-    path_map = np.column_stack([flown[a] for a in "xyz"]).astype(np.float64) if flown else np.zeros((0, 3))
     return PointMap(
         points_map=points,
         keyframe_id=vertex.get("keyframe", np.zeros(len(points))).astype(np.int64),
         range_m=vertex.get("range", np.zeros(len(points))).astype(np.float64),
-        path_map=path_map,
+        path_map=np.column_stack([flown[a] for a in "xyz"]).astype(np.float64) if flown else np.zeros((0, 3)),
         position_sigma_m=_number(told.get("position_sigma_m")),
         height_sigma_m=_number(told.get("height_sigma_m")),
-        scan_index=_scan_index(vertex.get("scan"), path_map),
+        scan_index=vertex["scan"].astype(np.int64) if "scan" in vertex else None,
     )
-
-
-def _scan_index(told: NDArray[Any] | None, path_map: Array) -> NDArray[np.int64] | None:
-    """Rows of the path; None where the file tells none, or such as its path does not have."""
-    index = None if told is None else np.asarray(told, dtype=np.int64)
-    fits = index is not None and bool(((index >= 0) & (index < len(path_map))).all())
-    return index if fits else None
 
 
 def _number(text: str | None) -> float:
@@ -155,15 +145,14 @@ def _load_las(path: Path) -> PointMap:
     for vlr in las.header.vlrs:
         if getattr(vlr, "user_id", "") == VLR_USER and getattr(vlr, "record_id", 0) == VLR_RECORD:
             told = json.loads(bytes(vlr.record_data))
-    path_map = np.asarray(told.get("path_map", []), dtype=np.float64).reshape(-1, 3)
     return PointMap(
         points_map=points,
         keyframe_id=np.asarray(las["keyframe"] if "keyframe" in names else np.zeros(len(points)), dtype=np.int64),
         range_m=np.asarray(las["range"] if "range" in names else np.zeros(len(points)), dtype=np.float64),
-        path_map=path_map,
+        path_map=np.asarray(told.get("path_map", []), dtype=np.float64).reshape(-1, 3),
         position_sigma_m=float(str(told.get("position_sigma_m", 0.0))),
         height_sigma_m=float(str(told.get("height_sigma_m", 0.0))),
-        scan_index=_scan_index(las["scan"] if "scan" in names else None, path_map),
+        scan_index=np.asarray(las["scan"], dtype=np.int64) if "scan" in names else None,
     )
 
 

@@ -143,15 +143,26 @@ def _alone(layers: Array, beside_columns: int, companions: int, before_columns: 
         reach = layers[0, c]
         if reach >= NEAR_M:
             continue
-        beside = -1  # itself
-        for k in range(-beside_columns, beside_columns + 1):
-            beside += int(abs(layers[0, (c + k) % columns] - reach) <= TOGETHER_M)
-        if beside < companions:
+        if beside(layers[0], c, beside_columns, 0.0)[0] < companions:
             was_there = True
             for n in range(1, scans + 1):
                 was_there = was_there and _was_there(layers[n], c, reach, n * before_columns)
             is_alone[c] = not was_there
     return is_alone
+
+
+@kernel
+def beside(row: Array | NDArray[np.float32], column: int, columns: int, leaning: float) -> tuple[int, int]:
+    """Of the returns so many columns to each side in a closed row (m; 0 or inf: no return): how many lie at this one's range,
+    and how many farther off. leaning: how much more the ranges of one thing differ, for each metre and column."""
+    own = float(row[column])
+    together, farther = 0, 0
+    for k in range(1, columns + 1):
+        reach = TOGETHER_M + leaning * k * own
+        left, right = float(row[(column - k) % len(row)]), float(row[(column + k) % len(row)])
+        together += int(left > 0.0 and abs(left - own) <= reach) + int(right > 0.0 and abs(right - own) <= reach)
+        farther += int(left > own + reach) + int(right > own + reach)
+    return together, farther
 
 
 @kernel

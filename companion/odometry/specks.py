@@ -9,11 +9,8 @@ from numpy.typing import NDArray
 
 from companion.jit import kernel
 from companion.messages import LevelledScan, LidarScan
-from companion.odometry.ranges import MOST_SPECKS_RATIO, NEAR_M
+from companion.odometry.ranges import MOST_SPECKS_RATIO, NEAR_M, THICK_BESIDE_COLUMNS, THICK_COMPANIONS, beside
 
-BESIDE_COLUMNS = 4  # to each side
-COMPANIONS = 3  # of the eight beside it: what makes a surface of a return
-TOGETHER_M = 0.4  # of range between returns of one surface: three sigma of the noise
 LEANING = 0.02  # more for each metre of range and column between them: a surface seen at 60 deg
 DUSTY_RATIO = 0.03  # of all returns stand alone in front of something
 
@@ -55,12 +52,7 @@ def lone_returns(range_m: NDArray[np.float32]) -> tuple[NDArray[np.bool_], int]:
             own = float(range_m[i, c])
             if not 0.0 < own < np.inf:
                 continue
-            beside, farther = 0, 0
-            for k in range(1, BESIDE_COLUMNS + 1):
-                reach = TOGETHER_M + LEANING * k * own
-                left, right = float(range_m[i, (c - k) % columns]), float(range_m[i, (c + k) % columns])
-                beside += int(left > 0.0 and abs(left - own) <= reach) + int(right > 0.0 and abs(right - own) <= reach)
-                farther += int(left > own + reach) + int(right > own + reach)
-            is_lone[i, c] = beside < COMPANIONS
-            in_front += int(is_lone[i, c] and farther > BESIDE_COLUMNS)
+            together, farther = beside(range_m[i], c, THICK_BESIDE_COLUMNS, LEANING)
+            is_lone[i, c] = together < THICK_COMPANIONS
+            in_front += int(is_lone[i, c] and farther > THICK_BESIDE_COLUMNS)
     return is_lone, in_front

@@ -40,13 +40,12 @@ def where_beams_meet(point_map: PointMap, cells: Cells, grid: Grid, wanted: Mask
     beams /= np.maximum(np.linalg.norm(beams, axis=1), 1e-9)[:, None]
     reach = int(np.ceil(WHOLE_SIGMA * noise_m / grid.cell_m))
     whole = ndimage.binary_erosion(wanted, iterations=reach) & cells.seen
-    met = cells
+    cell_of, place, met = cells.of_point[index], np.array([grid.x0_m, grid.y0_m, grid.cell_m]), cells
     for _ in range(PASSES):
         planes = local_planes(grid, met.x, met.y, met.z, np.minimum(met.kept, 20.0), radius_cells=1)
         known = np.isfinite(planes.z_m) & met.seen
         sums = _gather(
-            points, beams, cells.of_point[index], known, planes.z_m, planes.slope_x, planes.slope_y,
-            np.array([grid.x0_m, grid.y0_m, grid.cell_m]), FURTHEST_SIGMA * noise_m,
+            points, beams, cell_of, known, planes.z_m, planes.slope_x, planes.slope_y, place, FURTHEST_SIGMA * noise_m,
         )  # fmt: skip
         met = _moved(met, sums, grid, whole)
     return met

@@ -39,7 +39,7 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
         no surface at all gives volume NaN and the interval (0, inf).
     """
     points, told = point_map.points_map, point_map.scan_index
-    if told is not None and (len(told) != len(points) or not _are_rows(told, point_map.path_map)):
+    if told is not None and (len(told) != len(points) or not ((told >= 0) & (told < len(point_map.path_map))).all()):
         point_map = replace(point_map, scan_index=None)  # of another path, or another cloud
     finite: Mask = np.asarray(np.isfinite(points).all(axis=1))
     if not finite.all():
@@ -155,10 +155,6 @@ def _report(
         footprint_m=footprint.polygon_m,
         error_budget_m3=tuple(budget.items()),
     )
-
-
-def _are_rows(index: Index, of: Array) -> bool:
-    return bool(((index >= 0) & (index < len(of))).all())
 
 
 def _seen_from_above(point_map: PointMap) -> PointMap:

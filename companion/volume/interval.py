@@ -93,9 +93,9 @@ def _flanks(e: Evidence, area: Array) -> tuple[float, float, float, float]:
 
 def _per_range(e: Evidence, area: Array, flanks: tuple[float, ...]) -> float:
     """Volume that a metre added to all ranges adds: the pile sinks along its beams, and so does the floor below it."""
-    rise = e.cells.rise
-    on_floor = e.floor.cells & np.isfinite(rise) if rise is not None else np.zeros(e.grid.shape, dtype=np.bool_)
-    if rise is None or on_floor.sum() < LEAST_FLOOR_CELLS:
+    rise = np.full(e.grid.shape, np.nan) if e.cells.rise is None else e.cells.rise
+    on_floor = e.floor.cells & np.isfinite(rise)
+    if on_floor.sum() < LEAST_FLOOR_CELLS:
         return 0.3 * float(area.sum()) + 0.7 * sum(flanks)  # beams 20 to 45 deg down, from all sides
     x, y = e.grid.centres()
     design = np.stack([np.ones(e.grid.shape), x, y], axis=-1)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.odometry.ranges import _specks
-from companion.odometry.specks import BESIDE_COLUMNS, COMPANIONS, DUSTY_RATIO, lone_returns
+from companion.odometry.ranges import THICK_BESIDE_COLUMNS, THICK_COMPANIONS, _specks
+from companion.odometry.specks import DUSTY_RATIO, lone_returns
 
 COLUMNS = 512
 NOISE_M = 0.12
@@ -76,7 +76,7 @@ def test_what_never_returned_is_neither() -> None:
     is_lone, in_front = lone_returns(ranges)
     assert not is_lone.any()
     assert in_front == 0
-    assert 2 * BESIDE_COLUMNS > COMPANIONS
+    assert 2 * THICK_BESIDE_COLUMNS > THICK_COMPANIONS
 
 
 @pytest.mark.parametrize("free_path_m", [100.0, 60.0])
