@@ -79,7 +79,7 @@ def test_until_two_scans_came_before_every_return_counts(clear: tuple[LidarScan,
 
 
 @pytest.mark.parametrize(
-    ("visibility_m", "least", "most"), [(200.0, 0.0, 0.05), (100.0, 0.0, 0.15), (60.0, 0.0, 0.3), (20.0, 0.95, 1.0)]
+    ("visibility_m", "least", "most"), [(200.0, 0.0, 0.05), (100.0, 0.0, 0.15), (60.0, 0.0, 0.3), (12.0, 0.95, 1.0)]
 )
 def test_haze_is_flown_through_and_thick_dust_stops(
     clear: tuple[LidarScan, AttitudeHistory], visibility_m: float, least: float, most: float
