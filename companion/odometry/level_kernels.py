@@ -14,6 +14,11 @@ from companion.jit import kernel
 from companion.messages import Array
 from companion.odometry.attitude import interpolate_at
 
+LEAN_COLUMNS = 4  # to each side, whose median tells whether a surface leans
+LEAST_LEANING = 3
+LEAN_SIGMAS = 3.0
+STEEPEST = 2.5  # tangent of a pile's steepest face, a dug one
+SAME_M = 1.0  # of range between columns of one surface
 SECTORS = 8  # of a turn: what is too near is told by a layer's median over one, not by the noise of a block
 BLOCK_SPAN_M = 0.6  # of range, about the block's median, beyond which a return is not the same surface
 
@@ -121,16 +126,81 @@ def within_range(
 
 
 @kernel
-def layer_above(points: Array, row: NDArray[np.int64], layer_row: int, above_m: float) -> Array:
-    """(M, 2) x and y of the points of one row that lie higher than above_m in the level frame."""
+def upright_layer(
+    points: Array,
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    layer_row: int,
+    below_row: int,
+    columns: int,
+    above_m: float,
+    noise_m: float,
+    spacing_m: float,
+) -> Array:
+    """(M, 2) x and y of the points of one row that may be walls: see level.wall_layer. below_row: -1: not asked."""
+    width = 2.0 * math.pi / columns
+    apart, drop, reach = np.full(columns, np.nan), np.full(columns, np.nan), np.full(columns, np.nan)
+    if below_row >= 0:
+        _pair(points, row, column, layer_row, below_row, above_m, apart, drop, reach)
     out = np.empty((len(row), 2))
-    n = 0
+    near, low = np.empty(2 * LEAN_COLUMNS + 1), np.empty(2 * LEAN_COLUMNS + 1)
+    n, passed, last = 0, np.inf, -1
     for i in range(len(row)):
-        if row[i] == layer_row and points[i, 2] > above_m:
-            out[n, 0] = points[i, 0]
-            out[n, 1] = points[i, 1]
-            n += 1
+        if row[i] != layer_row or points[i, 2] <= above_m:
+            continue
+        if below_row >= 0 and _leans(apart, drop, reach, column[i], noise_m, near, low):
+            continue
+        if spacing_m > 0.0:
+            step = float(column[i] - last)
+            passed += step * width * math.hypot(points[i, 0], points[i, 1])
+            last = column[i]
+            if passed < spacing_m:
+                continue
+            passed = 0.0
+        out[n, 0] = points[i, 0]
+        out[n, 1] = points[i, 1]
+        n += 1
     return out[:n].copy()
+
+
+@kernel
+def _pair(
+    points: Array,
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    layer_row: int,
+    below_row: int,
+    above_m: float,
+    apart: Array,
+    drop: Array,
+    reach: Array,
+) -> None:
+    """For each column (all three (columns,), NaN before): the layer's distance from the axis, and by how much the row below
+    lies nearer and lower, where that is not the floor."""
+    height = np.full(len(apart), np.nan)
+    for i in range(len(row)):
+        if row[i] == layer_row:
+            reach[column[i]] = math.hypot(points[i, 0], points[i, 1])
+            height[column[i]] = points[i, 2]
+    for i in range(len(row)):
+        if row[i] == below_row and points[i, 2] > above_m:
+            apart[column[i]] = reach[column[i]] - math.hypot(points[i, 0], points[i, 1])
+            drop[column[i]] = height[column[i]] - points[i, 2]
+
+
+@kernel
+def _leans(apart: Array, drop: Array, reach: Array, column: int, noise_m: float, near: Array, low: Array) -> bool:
+    """Whether a surface leans back by more than noise lets it look. near, low: scratch."""
+    n, columns = 0, len(apart)
+    for k in range(-LEAN_COLUMNS, LEAN_COLUMNS + 1):
+        c = (column + k) % columns
+        if abs(reach[c] - reach[column]) < SAME_M and not math.isnan(apart[c]):
+            near[n], low[n] = apart[c], drop[c]
+            n += 1
+    if n < LEAST_LEANING:
+        return False
+    noise = LEAN_SIGMAS * 1.25 * math.sqrt(2.0 / n) * noise_m
+    return middle_of(near, n) > middle_of(low, n) / STEEPEST + noise
 
 
 @kernel

@@ -32,7 +32,7 @@ from companion.odometry.degeneracy import Judgement, judge, weak_direction
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
 from companion.odometry.keyframes import PlacedScan, WaitingScans
-from companion.odometry.level import AllReturns, Leveller, ReturnNoise, block_means, wall_layer
+from companion.odometry.level import LOW_M, AllReturns, Leveller, ReturnNoise, block_means, wall_layer
 from companion.odometry.ranges import SCANS, layer_ranges, wall_ranges
 from companion.odometry.relocalise import relocalise
 from companion.odometry.specks import specks, without_dust
@@ -43,7 +43,6 @@ PRIOR_COVARIANCE = np.diag(np.array([0.06, 0.06, 0.02]) ** 2)  # m, m, rad: hold
 FLOOR_VARIANCE = np.array([0.004, 0.004, 0.0004]) ** 2  # what a registration errs by at best: roughness, time stamps
 KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
 KEYFRAME_HEIGHT_LOW_M = 0.2  # below LOW_M, where nothing yet tells walls from the foot of a pile
-LOW_M = 1.5
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
 WAIT_FOR_FIRST_SCANS = 5
@@ -177,7 +176,8 @@ class Odometry:
         self._dust_ratio += DUST_RATE * (share - self._dust_ratio)
         if lone is not None:
             levelled = without_dust(scan, levelled, lone, self._return_noise.sigma_m)
-        layer = wall_layer(levelled, row, self.height.floor_below_m(float(vertical.x[0])))
+        z_m = float(vertical.x[0])
+        layer = wall_layer(levelled, scan.geometry, self.height.floor_below_m(z_m), z_m, self._return_noise.sigma_m)
         near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
         lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None

@@ -1,0 +1,90 @@
+"""What leans back is no wall: a pile beside the start does not carry the pose along while the vehicle climbs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from companion.messages import Array, LevelledScan, LidarGeometry
+from companion.odometry.level import LOW_SPACING_M, NO_PILE_ABOVE_M, wall_layer
+
+COLUMNS = 512
+DOWN = np.radians([0.0, 11.25, 22.5, 33.75, 45.0])
+NOISE_M = 0.12
+FOOT_M = 2.0  # from the start to the pile's foot, at -y; the walls are at x = +-20 and y = 15
+REPOSE = math.tan(math.radians(35.0))
+
+
+def seen_from(
+    z_m: float, rng: np.random.Generator, rows: int = 5
+) -> tuple[LevelledScan, LidarGeometry, NDArray[np.bool_]]:
+    """A levelled scan z_m above a level floor, its geometry, and which of its returns lie on the pile."""
+    bearing = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
+    down = np.radians([0.0]) if rows == 1 else DOWN
+    c, s = np.cos(bearing)[:, None], np.sin(bearing)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wall = np.minimum(20.0 / np.maximum(np.abs(c), 1e-9), np.where(s > 0, 15.0 / np.maximum(s, 1e-9), 1e9))
+        pile = (z_m + REPOSE * FOOT_M) / np.maximum(-s * REPOSE + np.tan(down), 1e-9)
+        pile = np.where(-s * pile >= FOOT_M, pile, 1e9)
+        floor = z_m / np.maximum(np.tan(down), 1e-9) * np.ones_like(s)
+    flat = np.minimum(np.minimum(wall, pile), floor)
+    on_pile = (pile == flat) & (pile < 1e8)
+    slant = flat / np.cos(down) + NOISE_M * rng.standard_normal(flat.shape)
+    flat = slant * np.cos(down)
+    points = np.stack([c * flat, s * flat, -slant * np.sin(down)], axis=-1).reshape(-1, 3)
+    column, row = (a.ravel() for a in np.mgrid[0:COLUMNS, 0 : len(down)])
+    directions = np.zeros((len(down), COLUMNS, 3))
+    geometry = LidarGeometry(directions=directions, offsets_m=directions, elevation_rad=-down, horizontal_row=0)
+    scan = LevelledScan(
+        t_ns=0, points_level=points, range_m=slant.ravel(), row=row, column=column, origin_level_m=np.zeros(3)
+    )
+    return scan, geometry, on_pile.ravel()
+
+
+def layer_at(z_m: float, rows: int = 5) -> tuple[Array, Array]:
+    """The wall layer at a height, and the horizontal layer's places on the pile."""
+    scan, geometry, on_pile = seen_from(z_m, np.random.default_rng(1), rows)
+    layer = wall_layer(scan, geometry, 0.1 - z_m, z_m, NOISE_M)
+    return layer, scan.points_level[on_pile & (scan.row == 0)][:, :2]
+
+
+def on_slope(layer: Array) -> int:
+    return int(((layer[:, 1] < -0.5 * FOOT_M) & (np.abs(layer[:, 0]) < 19.0)).sum())
+
+
+@pytest.mark.parametrize("z_m", [1.0, 2.0, 4.0])
+def test_a_slope_beside_the_start_is_no_wall_and_the_walls_are(z_m: float) -> None:
+    layer, pile = layer_at(z_m)
+    assert len(pile) > 100
+    assert on_slope(layer) < 0.15 * len(pile)
+    assert (np.abs(layer[:, 1] - 15.0) < 0.6).sum() > 60
+    assert (np.abs(layer[:, 0] - 20.0) < 0.6).sum() > 20
+
+
+def test_on_the_ground_the_foot_of_a_pile_has_no_majority() -> None:
+    layer, pile = layer_at(0.3)
+    assert len(pile) > 200
+    assert on_slope(layer) < 0.45 * len(layer)
+
+
+def test_low_down_what_is_close_counts_by_its_width() -> None:
+    layer, pile = layer_at(0.3)
+    near, seen = np.hypot(*layer.T) < 3.0, np.hypot(*pile.T) < 3.0
+    width = np.ptp(pile[seen][:, 0])
+    assert seen.sum() > 100
+    assert near.sum() == pytest.approx(width / LOW_SPACING_M, rel=0.3)
+
+
+def test_at_the_height_of_flight_every_return_may_be_a_wall() -> None:
+    scan, geometry, _ = seen_from(NO_PILE_ABOVE_M + 1.0, np.random.default_rng(2))
+    layer = wall_layer(scan, geometry, -NO_PILE_ABOVE_M, NO_PILE_ABOVE_M + 1.0, NOISE_M)
+    assert len(layer) == int((scan.row == 0).sum())
+
+
+def test_a_sensor_of_one_layer_keeps_its_slope() -> None:
+    layer, pile = layer_at(2.0, rows=1)
+    assert len(layer) == COLUMNS
+    assert on_slope(layer) > 0.9 * len(pile)
