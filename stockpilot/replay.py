@@ -25,6 +25,7 @@ from companion.recording.manifest import require_unaltered
 from companion.recording.replay import Replay, TopicDifference, compare
 from companion.recording.run_files import RunRecording, read_run, recording_path
 from companion.recording.tum import tum_line
+from stockpilot.files import finite, write_json
 from stockpilot.mission import parse_setting
 
 EXIT_DIFFERENT = 1
@@ -138,7 +139,7 @@ def replay_command(
         said["identical"] = all(d.first is None for d in differences)
     if out is not None:
         write_results(out, again, said)
-    typer.echo(json.dumps(said, indent=2) if as_json else describe(said))
+    typer.echo(json.dumps(finite(said), indent=2) if as_json else describe(said))
     raise typer.Exit(EXIT_DIFFERENT if any(d.first for d in differences) else 0)
 
 
@@ -223,7 +224,17 @@ def write_results(folder: Path, again: Replayed, said: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     save_point_map(again.flight.mapper.point_map(), folder / "map.ply")
     (folder / "trajectory.tum").write_text("".join(tum_line(e) for e in again.estimates), encoding="utf-8")
-    (folder / "report.json").write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "report.json", said)
+
+
+def _span(interval_m3: list[float | None]) -> str:
+    """high: None or infinite where a flight was cut short."""
+    low, high = interval_m3
+    return (
+        f"interval {low or 0.0:.2f} to {high:.2f}"
+        if high is not None and high < float("inf")
+        else f"at least {low or 0.0:.2f}"
+    )
 
 
 def _beside(recorded: dict[str, Any]) -> str:
@@ -231,8 +242,7 @@ def _beside(recorded: dict[str, Any]) -> str:
     if "volume_m3" in recorded:
         parts.append(f"volume {recorded['volume_m3']:.2f} m3")
     if "volume_interval_m3" in recorded:
-        low, high = recorded["volume_interval_m3"]
-        parts.append(f"interval {low:.2f} to {high:.2f}")
+        parts.append(_span(recorded["volume_interval_m3"]))
     if "seen_ratio" in recorded:
         parts.append(f"seen {recorded['seen_ratio']:.1%}")
     if "keyframes" in recorded:
@@ -249,10 +259,8 @@ def describe(said: dict[str, Any]) -> str:
         f"degenerate {said['degenerate_scans']}, ended in {said['state']}",
     ]
     if "volume_m3" in said:
-        low, high = said["volume_interval_m3"]
-        lines.append(
-            f"volume {said['volume_m3']:.2f} m3, interval {low:.2f} to {high:.2f}, seen {said['seen_ratio']:.1%}"
-        )
+        span = _span(said["volume_interval_m3"])
+        lines.append(f"volume {said['volume_m3']:.2f} m3, {span}, seen {said['seen_ratio']:.1%}")
         lines += [f"  {w}" for w in said["warnings"]]
     if said.get("recorded"):
         lines.append(f"the run itself told {_beside(said['recorded'])}")
