@@ -79,15 +79,17 @@ class Leveller:
         return levelled, every
 
 
-def wall_layer(levelled: LevelledScan, geometry: LidarGeometry, above_m: float, z_m: float, noise_m: float) -> Array:
+def wall_layer(
+    levelled: LevelledScan, geometry: LidarGeometry, above_m: float, z_m: float, noise_m: float, *, is_climbing: bool
+) -> Array:
     """(N, 2) x and y of the horizontal layer's returns that may be walls, in the levelled frame.
 
     Not those that lie no higher than above_m: floor. Below NO_PILE_ABOVE_M (z_m: height above where it stood) not those of a
-    surface that leans back, by what the layer below sees of it: a pile, whose line moves away as the vehicle climbs. Below
-    LOW_M, where that cannot be told yet, one for each LOW_SPACING_M of width: the foot of a pile close by fills half of the
-    turn, and outvotes the walls.
+    surface that leans back, by what the layer below sees of it: a pile, whose line moves away as the vehicle climbs. Off the
+    ground (is_climbing) and below LOW_M, where that cannot be told yet, one for each LOW_SPACING_M of width: the foot of a
+    pile close by fills half of the turn, and outvotes the walls.
     """
-    spacing_m = LOW_SPACING_M if z_m < LOW_M else 0.0
+    spacing_m = LOW_SPACING_M if is_climbing and z_m < LOW_M else 0.0
     below = _row_below(geometry.elevation_rad, geometry.horizontal_row) if z_m < NO_PILE_ABOVE_M else -1
     shape = geometry.directions.shape[1]
     return lk.upright_layer(

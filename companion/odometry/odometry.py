@@ -177,7 +177,14 @@ class Odometry:
         if lone is not None:
             levelled = without_dust(scan, levelled, lone, self._return_noise.sigma_m)
         z_m = float(vertical.x[0])
-        layer = wall_layer(levelled, scan.geometry, self.height.floor_below_m(z_m), z_m, self._return_noise.sigma_m)
+        layer = wall_layer(
+            levelled,
+            scan.geometry,
+            self.height.floor_below_m(z_m),
+            z_m,
+            self._return_noise.sigma_m,
+            is_climbing=self._is_released,
+        )
         near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
         lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None

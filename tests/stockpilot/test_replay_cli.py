@@ -128,7 +128,9 @@ def test_report_is_set_beside_what_the_run_told(flown: Path, tmp_path: Path) -> 
     }
     assert "the run itself told volume 34.50 m3, interval 30.00 to 39.00, seen 50.0%, keyframes 12" in describe(said)
     (folder / "report.json").write_text(json.dumps(told | {"volume_interval_m3": [30.0, None]}), encoding="utf-8")
-    assert "told volume 34.50 m3, at least 30.00," in describe(run(folder, "--report")[1])  # a flight that was cut short
+    assert "told volume 34.50 m3, at least 30.00," in describe(
+        run(folder, "--report")[1]
+    )  # a flight that was cut short
     _, said = run(flown, "--report")
     assert said["recorded"] == {}
 

@@ -44,10 +44,10 @@ def seen_from(
     return scan, geometry, on_pile.ravel()
 
 
-def layer_at(z_m: float, rows: int = 5) -> tuple[Array, Array]:
+def layer_at(z_m: float, rows: int = 5, *, is_climbing: bool = True) -> tuple[Array, Array]:
     """The wall layer at a height, and the horizontal layer's places on the pile."""
     scan, geometry, on_pile = seen_from(z_m, np.random.default_rng(1), rows)
-    layer = wall_layer(scan, geometry, 0.1 - z_m, z_m, NOISE_M)
+    layer = wall_layer(scan, geometry, 0.1 - z_m, z_m, NOISE_M, is_climbing=is_climbing)
     return layer, scan.points_level[on_pile & (scan.row == 0)][:, :2]
 
 
@@ -78,9 +78,15 @@ def test_low_down_what_is_close_counts_by_its_width() -> None:
     assert near.sum() == pytest.approx(width / LOW_SPACING_M, rel=0.3)
 
 
+def test_standing_every_return_above_the_floor_counts() -> None:
+    layer, pile = layer_at(0.3, is_climbing=False)
+    assert len(layer) > 0.9 * COLUMNS
+    assert on_slope(layer) > 0.9 * len(pile)
+
+
 def test_at_the_height_of_flight_every_return_may_be_a_wall() -> None:
     scan, geometry, _ = seen_from(NO_PILE_ABOVE_M + 1.0, np.random.default_rng(2))
-    layer = wall_layer(scan, geometry, -NO_PILE_ABOVE_M, NO_PILE_ABOVE_M + 1.0, NOISE_M)
+    layer = wall_layer(scan, geometry, -NO_PILE_ABOVE_M, NO_PILE_ABOVE_M + 1.0, NOISE_M, is_climbing=True)
     assert len(layer) == int((scan.row == 0).sum())
 
 
