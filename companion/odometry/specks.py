@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from companion.jit import kernel
 from companion.messages import LevelledScan, LidarScan
-from companion.odometry.ranges import MOST_SPECKS_RATIO, NEAR_M, THICK_BESIDE_COLUMNS, THICK_COMPANIONS, beside
+from companion.odometry.ranges import (
+    MOST_SPECKS_RATIO,
+    NEAR_M,
+    THICK_BESIDE_COLUMNS,
+    THICK_COMPANIONS,
+    beside,
+    has_beside,
+)
 
 LEANING = 0.02  # more for each metre of range and column between them: a surface seen at 60 deg
 DUSTY_RATIO = 0.03  # of all returns stand alone in front of something
@@ -52,7 +59,9 @@ def lone_returns(range_m: NDArray[np.float32]) -> tuple[NDArray[np.bool_], int]:
             own = float(range_m[i, c])
             if not 0.0 < own < np.inf:
                 continue
-            together, farther = beside(range_m[i], c, THICK_BESIDE_COLUMNS, LEANING)
-            is_lone[i, c] = together < THICK_COMPANIONS
-            in_front += int(is_lone[i, c] and farther > THICK_BESIDE_COLUMNS)
+            if has_beside(range_m[i], c, THICK_BESIDE_COLUMNS, LEANING, THICK_COMPANIONS):
+                continue
+            _, farther = beside(range_m[i], c, THICK_BESIDE_COLUMNS, LEANING)
+            is_lone[i, c] = True
+            in_front += int(farther > THICK_BESIDE_COLUMNS)
     return is_lone, in_front
