@@ -159,7 +159,7 @@ def _alone(
         reach = layers[0, c]
         if not from_m <= reach < to_m:
             continue
-        if beside(layers[0], c, beside_columns, leaning)[0] < companions:
+        if not has_beside(layers[0], c, beside_columns, leaning, companions):
             was_there = True
             for n in range(1, scans + 1):
                 was_there = was_there and _was_there(layers[n], c, reach, n * before_columns)
@@ -175,10 +175,35 @@ def beside(row: Array | NDArray[np.float32], column: int, columns: int, leaning:
     together, farther = 0, 0
     for k in range(1, columns + 1):
         reach = TOGETHER_M + leaning * k * own
-        left, right = float(row[(column - k) % len(row)]), float(row[(column + k) % len(row)])
+        left, right = _neighbours(row, column, k)
         together += int(left > 0.0 and abs(left - own) <= reach) + int(right > 0.0 and abs(right - own) <= reach)
         farther += int(left > own + reach) + int(right > own + reach)
     return together, farther
+
+
+@kernel
+def has_beside(row: Array | NDArray[np.float32], column: int, columns: int, leaning: float, companions: int) -> bool:
+    """Whether so many returns lie together with this one, as `beside` counts them: most are seen in the first columns."""
+    own = float(row[column])
+    together = 0
+    for k in range(1, columns + 1):
+        reach = TOGETHER_M + leaning * k * own
+        left, right = _neighbours(row, column, k)
+        together += int(left > 0.0 and abs(left - own) <= reach) + int(right > 0.0 and abs(right - own) <= reach)
+        if together >= companions:
+            return True
+    return False
+
+
+@kernel
+def _neighbours(row: Array | NDArray[np.float32], column: int, k: int) -> tuple[float, float]:
+    """Of a closed row, k columns to the left and right; a remainder is taken only at its seam: it is slow."""
+    left, right = column - k, column + k
+    if left < 0:
+        left = left % len(row)
+    if right >= len(row):
+        right = right % len(row)
+    return float(row[left]), float(row[right])
 
 
 @kernel

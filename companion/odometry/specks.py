@@ -16,6 +16,7 @@ from companion.odometry.ranges import (
     THICK_COMPANIONS,
     TOGETHER_M,
     beside,
+    has_beside,
 )
 
 OFF_SIGMAS = 3.0  # off the surface of its neighbours, in dust
@@ -60,9 +61,11 @@ def lone_returns(range_m: NDArray[np.float32]) -> tuple[NDArray[np.bool_], int]:
             own = float(range_m[i, c])
             if not 0.0 < own < np.inf:
                 continue
-            together, farther = beside(range_m[i], c, THICK_BESIDE_COLUMNS, LEANING)
-            is_lone[i, c] = together < THICK_COMPANIONS
-            in_front += int(is_lone[i, c] and farther > THICK_BESIDE_COLUMNS)
+            if has_beside(range_m[i], c, THICK_BESIDE_COLUMNS, LEANING, THICK_COMPANIONS):
+                continue
+            _, farther = beside(range_m[i], c, THICK_BESIDE_COLUMNS, LEANING)
+            is_lone[i, c] = True
+            in_front += int(farther > THICK_BESIDE_COLUMNS)
     return is_lone, in_front
 
 
