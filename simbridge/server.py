@@ -13,6 +13,7 @@ from simbridge.loop import Simulation
 
 RECEIVE_BYTES = 2048
 BEHIND_LIMIT_S = 0.25  # farther behind than this, lost time is let go instead of caught up in a burst
+LATE_TICK_S = 0.02  # a step that ends this far behind is counted: what is on the wire comes that late
 
 
 class MavlinkEndpoint(Protocol):
@@ -66,27 +67,69 @@ class UdpLink:
         self._socket.close()
 
 
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """One step of a paced world, once it had waited."""
+
+    wall_s: float  # time.monotonic
+    t_ns: int
+    late_ticks: int  # up to here
+
+
+@dataclass(frozen=True, slots=True)
+class Pacing:
+    """How well a stretch kept its pace."""
+
+    wall_time_s: float
+    sim_time_s: float
+    late_ticks: int  # steps that ended more than LATE_TICK_S behind real time
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """None: no time has passed."""
+        return self.sim_time_s / self.wall_time_s if self.wall_time_s > 0 else None
+
+
 @dataclass(slots=True)
 class Pace:
     """Keeps simulated time at `speed` times wall time. speed 0: as fast as it goes."""
 
     speed: float
-    _wall0_s: float | None = None
+    _wall0_s: float = 0.0
     _sim0_ns: int = 0
-    late_s: float = 0.0
+    late_s: float = 0.0  # let go, all in all
+    _late_ticks: int = 0
+    _first: Tick | None = None
+    newest: Tick | None = None
 
     def wait(self, t_ns: int) -> None:
-        if self.speed <= 0:
-            return
         now = time.monotonic()
-        if self._wall0_s is None:
+        if self._first is None:  # what came before (an autopilot's boot) is not paced
             self._wall0_s, self._sim0_ns = now, t_ns
-        target = self._wall0_s + (t_ns - self._sim0_ns) * 1e-9 / self.speed
-        if target > now:
-            time.sleep(target - now)
-        elif now - target > BEHIND_LIMIT_S:
-            self.late_s += now - target
-            self._wall0_s += now - target
+            self._first = self.newest = Tick(now, t_ns, 0)
+            return
+        if self.speed > 0:
+            target = self._wall0_s + (t_ns - self._sim0_ns) * 1e-9 / self.speed
+            behind_s = now - target
+            if behind_s < 0:
+                time.sleep(-behind_s)
+                now = time.monotonic()
+            self._late_ticks += behind_s > LATE_TICK_S
+            if behind_s > BEHIND_LIMIT_S:
+                self.late_s += behind_s
+                self._wall0_s += behind_s
+        self.newest = Tick(now, t_ns, self._late_ticks)
+
+    def since(self, tick: Tick | None = None) -> Pacing:
+        """From `tick` (None: the first) to the newest."""
+        first, newest = tick or self._first, self.newest
+        if first is None or newest is None:
+            return Pacing(wall_time_s=0.0, sim_time_s=0.0, late_ticks=0)
+        return Pacing(
+            wall_time_s=newest.wall_s - first.wall_s,
+            sim_time_s=(newest.t_ns - first.t_ns) * 1e-9,
+            late_ticks=newest.late_ticks - first.late_ticks,
+        )
 
 
 def serve(

@@ -17,16 +17,16 @@ from simbridge.loop import Simulation
 from simbridge.sensors import BaroSample, ImuSample
 from simbridge.server import UdpLink
 from simbridge.sitl import SitlError, parameters
-from simbridge.sitl.ardupilot import PHYSICS_PORT, ArduPilotSitl
+from simbridge.sitl.ardupilot import ArduPilotSitl
+from simbridge.sitl.ports import Port, arducopter_ports, first_free_instance, px4_ports, require_free
 from simbridge.sitl.process import start_arducopter, start_px4
-from simbridge.sitl.px4 import SIMULATOR_PORT, Px4Sitl
+from simbridge.sitl.px4 import Px4Sitl
 
 Array = NDArray[np.float64]
 
 COMPANION_PORT = 14540  # where PX4 sends; ArduCopter is told to
 GROUND_PORT = 14550
 PX4_ITS_PORT_ABOVE = 40  # PX4 itself binds 14580 for the link to 14540
-PX4_INSTANCES = 10
 OFFBOARD_URL, GROUND_URL = f"udpin://127.0.0.1:{COMPANION_PORT}", f"udpin://127.0.0.1:{GROUND_PORT}"
 PX4_COMMANDS_PER_STEP, PX4_STEP_NS = 1, 4_000_000
 ARDUPILOT_COMMANDS_PER_STEP, ARDUPILOT_STEP_NS = 4, 5_000_000  # 800 Hz
@@ -70,7 +70,10 @@ class RealWire:
 def prepare_real(cfg: SimConfig, autopilot: str, binary: Path | None) -> tuple[Simulation, RealWire, ExitStack]:
     """World, wire and what ends them, for a flight in lockstep. Raises: ConfigError, LinkError."""
     with ExitStack() as stack:
-        link = _companion_link(autopilot, is_ours=binary is not None)
+        try:
+            link = _companion_link(autopilot, is_ours=binary is not None)
+        except (SitlError, OSError) as error:
+            raise LinkError(str(error)) from error
         stack.callback(link.close)
         simulation, closing = simulation_for(cfg, autopilot, binary, companion_port=link.port)
         stack.enter_context(closing)
@@ -101,20 +104,28 @@ def simulation_for(
 
 
 def _companion_link(autopilot: str, *, is_ours: bool) -> UdpLink:
-    """Where the autopilot sends: the usual port, or for one that we start, and can tell, a free one."""
-    ports = [COMPANION_PORT]
+    """Where the autopilot sends: the usual port, or for one that we start, and can tell, a free one.
+
+    PX4's port is of its instance: one all of whose ports are free, its own ones too. Raises: SitlError: there is none.
+    """
+    if is_ours and autopilot == "ardupilot":
+        return UdpLink(remote=("127.0.0.1", 0), local=("127.0.0.1", 0))  # it answers whoever spoke
     if is_ours:
-        ports = [0] if autopilot == "ardupilot" else [COMPANION_PORT + i for i in range(PX4_INSTANCES)]
-    for port in ports:
-        try:
-            return UdpLink(remote=("127.0.0.1", port + PX4_ITS_PORT_ABOVE), local=("127.0.0.1", port))
-        except OSError as error:
-            reason = error.strerror
-    raise LinkError(f"UDP port {ports[-1]}, where the autopilot sends, is taken ({reason}): another companion?")
+        port = _companion_port(first_free_instance(lambda i: (_companion_port(i), *px4_ports(i)))).number
+    else:
+        require_free([_companion_port(0)])
+        port = COMPANION_PORT
+    return UdpLink(remote=("127.0.0.1", port + PX4_ITS_PORT_ABOVE), local=("127.0.0.1", port))
+
+
+def _companion_port(instance: int) -> Port:
+    return Port("UDP", COMPANION_PORT + instance, "where the autopilot sends to the companion")
 
 
 def _with_px4(cfg: SimConfig, binary: Path | None, stack: ExitStack, instance: int) -> Simulation:
-    sitl = Px4Sitl(port=SIMULATOR_PORT + instance, seed=cfg.seed)
+    ports = px4_ports(instance)
+    require_free(ports if binary is not None else ports[:1])  # of a user's own PX4 the others are its own matter
+    sitl = Px4Sitl(port=ports[0].number, seed=cfg.seed)
     stack.callback(sitl.close)
     if binary is None:
         _say(f"waiting for a PX4 (PX4_SIM_MODEL=none_iris) on TCP {sitl.port}")
@@ -129,13 +140,14 @@ def _with_arducopter(cfg: SimConfig, binary: Path | None, stack: ExitStack, comp
     if cfg.autopilot.params:
         names = ", ".join(sorted(cfg.autopilot.params))
         raise ConfigError(f"autopilot.params: {names}: are PX4's; a mission for ArduCopter has none")
-    sitl = ArduPilotSitl(port=PHYSICS_PORT if binary is None else 0)
+    instance = 0 if binary is None else first_free_instance(arducopter_ports)
+    sitl = ArduPilotSitl(port=arducopter_ports(instance)[0].number)
     stack.callback(sitl.close)
     if binary is None:
         _say(f"waiting for an ArduCopter (--model JSON:127.0.0.1) on UDP {sitl.port}")
     else:
         ports = {"physics_port": sitl.port, "offboard_port": companion_port, "ground_port": GROUND_PORT}
-        sitl.process = stack.enter_context(start_arducopter(binary, parameters.ARDUPILOT, **ports))
+        sitl.process = stack.enter_context(start_arducopter(binary, parameters.ARDUPILOT, instance=instance, **ports))
     simulation = Simulation(
         cfg, RealController(sitl), step_ns=ARDUPILOT_STEP_NS, commands_per_step=ARDUPILOT_COMMANDS_PER_STEP
     )

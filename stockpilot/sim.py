@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -14,7 +13,7 @@ from rich.console import Console
 
 from companion.errors import ConfigError, LinkError
 from simbridge.loop import Simulation
-from simbridge.server import MavlinkEndpoint, Pace, UdpLink, serve
+from simbridge.server import MavlinkEndpoint, Pace, Tick, UdpLink, serve
 from stockpilot.addresses import parse_address
 from stockpilot.mission import load_mission
 
@@ -69,11 +68,15 @@ def sim_command(
         f"[bold]{mission.name}[/] in real time x {speed:g}: MAVLink to {offboard} and {ground}, LiDAR to {lidar}; Ctrl-C stops"
     )
     began_ns = simulation.t_ns
-    last = {"wall": time.monotonic(), "late": 0.0}
+    told_late_s = 0.0
+    liftoff: Tick | None = None
 
     def each_second(world: Simulation, pace: Pace) -> None:
-        if pace.late_s > last["late"] + 0.5:
-            last["late"] = pace.late_s
+        nonlocal told_late_s, liftoff
+        if liftoff is None and world.liftoff_ns is not None:
+            liftoff = pace.newest
+        if pace.late_s > told_late_s + 0.5:
+            told_late_s = pace.late_s
             console.print(f"[yellow]this machine is too slow: {pace.late_s:.1f} s behind real time so far[/]")
         if world.collision and not stop.told_collision:
             stop.told_collision = True
@@ -86,13 +89,23 @@ def sim_command(
         pace = serve(simulation, endpoint, links, lidar_link, speed=speed, stop=finished, each_second=each_second)
     finally:
         close()
+    paced = pace.since()
+    in_flight = pace.since(liftoff) if liftoff is not None else None
     summary = {
         "mission": mission.name, "seed": mission.seed, "autopilot": autopilot,
-        "simulated_s": (simulation.t_ns - began_ns) * 1e-9, "late_s": pace.late_s,
+        "wall_time_s": paced.wall_time_s, "sim_time_s": paced.sim_time_s,
+        "real_time_factor": paced.real_time_factor, "late_ticks": paced.late_ticks, "late_s": pace.late_s,
+        # From lift-off on; what came before is an autopilot's boot and the companion's warming up.
+        "real_time_factor_in_flight": in_flight.real_time_factor if in_flight is not None else None,
+        "late_ticks_in_flight": in_flight.late_ticks if in_flight is not None else None,
         "collision": simulation.collision, "min_clearance_m": simulation.min_clearance_m,
     }  # fmt: skip
-    typer.echo(json.dumps(summary, indent=2) if as_json else "\n".join(f"{k:16} {v}" for k, v in summary.items()))
+    typer.echo(json.dumps(summary, indent=2) if as_json else "\n".join(_line(k, v) for k, v in summary.items()))
     return 0
+
+
+def _line(name: str, value: object) -> str:
+    return f"{name:26} {f'{value:.3f}' if isinstance(value, float) else '-' if value is None else value}"
 
 
 class _Stop:

@@ -68,9 +68,36 @@ def test_two_programs_fly_and_sigterm_lands_with_everything_recorded(tmp_path: P
     report = json.loads(printed)
     assert report["state"] == "aborted", said.text()
     assert report["scans"] > 100
-    assert json.loads(world_said)["collision"] is False, world_errors
+    world_summary = json.loads(world_said)
+    assert world_summary["collision"] is False, world_errors
+    assert world_summary["sim_time_s"] > 50  # the time sync alone
+    assert world_summary["real_time_factor"] == pytest.approx(
+        world_summary["sim_time_s"] / world_summary["wall_time_s"], rel=1e-9
+    )
+    assert 0.3 < world_summary["real_time_factor_in_flight"] < 1.02  # never ahead; behind on a busy machine
     for name in ("recording.mcap", "telemetry.tlog", "report.json", "map.ply"):
         assert (out / name).stat().st_size > 0, name
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5])
+def test_sim_says_how_well_it_kept_its_pace(tmp_path: Path, speed: float) -> None:
+    mission = tmp_path / "small_hall.yaml"
+    mission.write_text(yaml.safe_dump(SMALL_HALL), encoding="utf-8")
+    command = [
+        "sim", str(mission), "--offboard", f"udpout://127.0.0.1:{free_port()}", "--lidar", f"udp://127.0.0.1:{free_port()}",
+        "--ground", f"udpout://127.0.0.1:{free_port()}", "--speed", str(speed), "--duration", "2", "--json",
+    ]  # fmt: skip
+    with stockpilot(*command) as world:
+        try:
+            said, errors = world.communicate(timeout=100)
+        finally:
+            world.kill()
+    summary = json.loads(said)
+    assert summary["sim_time_s"] == pytest.approx(2.0, abs=0.05), errors
+    assert summary["real_time_factor"] <= speed * 1.001
+    assert summary["wall_time_s"] * summary["real_time_factor"] == pytest.approx(summary["sim_time_s"])
+    assert summary["late_ticks"] >= 0
+    assert summary["real_time_factor_in_flight"] is None  # it never left the ground
 
 
 class Listener:

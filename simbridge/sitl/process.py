@@ -106,19 +106,22 @@ def start_arducopter(
     physics_port: int = 9002,
     offboard_port: int = 14540,
     ground_port: int = 14550,
+    instance: int = 0,
     speedup: float = UNPACED_SPEEDUP,
     home: tuple[float, float, float] = (47.4, 8.5, 0.0),
 ) -> AutopilotProcess:
     """Start ArduCopter SITL as a client of our JSON physics; its MAVLink goes to two UDP ports of this machine.
 
-    Args as for `start_px4`. home: latitude, longitude (degrees), altitude (metres) that its own sensors are made for.
+    Args as for `start_px4`. instance: ten times it is added to the numbers of the ports that are not given here.
+    home: latitude, longitude (degrees), altitude (metres) that its own sensors are made for.
     """
     binary = _executable(binary)
     work, owned = _fresh_folder(folder)
     defaults = work / "stockpilot.parm"
     defaults.write_text("".join(f"{name} {value:g}\n" for name, value in parameters.items()), encoding="ascii")
     command = [
-        str(binary), "--model", "JSON:127.0.0.1", "--sim-port-out", str(physics_port), "--defaults", str(defaults), "--wipe",
+        str(binary), "--instance", str(instance), "--model", "JSON:127.0.0.1", "--sim-port-out", str(physics_port),
+        "--defaults", str(defaults), "--wipe",
         "--speedup", f"{speedup:g}", "--rate", str(ARDUPILOT_RATE_HZ),
         "--home", f"{home[0]},{home[1]},{home[2]},0",
         "--serial0", f"udpclient:127.0.0.1:{offboard_port}", "--serial1", f"udpclient:127.0.0.1:{ground_port}",

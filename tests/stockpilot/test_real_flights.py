@@ -10,6 +10,8 @@ import pytest
 from companion.messages import FlightMode
 from simbridge.link_frames import message_id
 from simbridge.sitl import parameters
+from simbridge.sitl.ardupilot import PHYSICS_PORT
+from simbridge.sitl.ports import ARDUCOPTER_STEP
 from simbridge.sitl.process import AutopilotProcess, start_arducopter, start_px4
 from simbridge.sitl.px4 import SIMULATOR_PORT
 from stockpilot.lockstep import Lockstep
@@ -49,7 +51,8 @@ def start_again(prepared: Prepared, kind: str) -> AutopilotProcess:
     if kind == "px4":
         return start_px4(real_binary(kind), parameters.PX4, instance=sitl.port - SIMULATOR_PORT)
     ports = {"physics_port": sitl.port, "offboard_port": link.port, "ground_port": 14550}
-    return start_arducopter(real_binary(kind), parameters.ARDUPILOT, **ports)
+    instance = (sitl.port - PHYSICS_PORT) // ARDUCOPTER_STEP
+    return start_arducopter(real_binary(kind), parameters.ARDUPILOT, instance=instance, **ports)
 
 
 def fly_until(run: Lockstep, seconds_after_liftoff: float, limit_s: float = 300.0) -> None:
