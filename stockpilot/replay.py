@@ -131,8 +131,10 @@ def replay_command(
     """
     if out is not None:
         make_folder(out)
-    again = replay_run(run, settings or (), keep_messages=diff)
     folder = recording_path(run).parent
+    if diff or report:
+        require_unaltered(folder, ["map.ply", "report.json"])  # it is set beside them
+    again = replay_run(run, settings or (), keep_messages=diff)
     left = left_behind(folder) if diff else {}
     measured = again.recording.topics.get(VOLUME.name, [])
     wanted = report or out is not None or "volume_m3" in left or bool(measured)

@@ -22,6 +22,7 @@ from companion.lidar.ouster import OusterDecoder
 from companion.lidar.pcap import PcapReader
 from companion.messages import Array, LidarScan
 from companion.recording import channels
+from companion.recording.manifest import require_unaltered_file
 from companion.recording.mcap_read import Attachment, McapScan, Message, open_mcap
 from stockpilot.file_kinds import FileKind, file_kind
 
@@ -59,9 +60,10 @@ def open_scans(path: Path, *, metadata: Path | None = None, topic: str | None = 
 
     Args:
         metadata: an Ouster sensor's JSON; default: the one beside the capture. topic: of several, which.
-    Raises: FileFormatError: not a recording, or there are no scans in it.
+    Raises: FileFormatError: not a recording, there are no scans in it, or it is of a run and was altered since.
     """
     kind, file = file_kind(path)
+    require_unaltered_file(file)
     if kind is FileKind.PCAP:
         return _open_capture(file, metadata)
     if kind is FileKind.MCAP:

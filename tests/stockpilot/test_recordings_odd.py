@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from companion.errors import FileFormatError
 from companion.lidar.pcap import PcapReader
+from companion.recording.manifest import write_manifest
 from stockpilot import odometry_cli, replay
 from stockpilot.files import begin_folder, fresh_folder, make_folder
 from stockpilot.info import contents_of, info_command
@@ -20,6 +21,7 @@ from stockpilot.recover import recover_command
 from stockpilot.replay import replay_command
 from stockpilot.replay_check import REPLAYS
 from stockpilot.scan_files import open_scans
+from stockpilot.volume_cli import volume_command
 from tests.companion.lidar.packets import frame_packets, sensor
 from tests.companion.lidar.test_pcap import classic
 from tests.companion.recording.samples import small_recording
@@ -192,3 +194,40 @@ def test_report_beside_a_recording_that_is_no_report_is_left_alone(tmp_path: Pat
     (tmp_path / "report.json").write_text("[]")
     assert replay.left_behind(tmp_path) == {}
     assert replay.told_by_run(tmp_path) == {}
+
+
+def test_altered_files_of_a_run_are_refused_by_every_command_that_reads_them(tmp_path: Path) -> None:
+    """FAULTS 32: "a recording or map was altered": "refused, shown"."""
+    recorder = a_recorder(tmp_path, lidar=sensor().to_json_string().encode())
+    for n, packet in enumerate(p for k in range(3) for p in frame_packets(sensor(), k)):
+        recorder.input("lidar", n * 3_000_000, packet, None)
+    recorder.close()
+    for name in ("map.ply", "report.json"):
+        (tmp_path / name).write_text("as the run left it")
+    write_manifest(tmp_path)
+    recording = tmp_path / "recording.mcap"
+    assert run(odometry_command, recording)[0] in (0, 1)  # read
+    (tmp_path / "map.ply").write_text("as somebody else left")
+    (tmp_path / "report.json").write_text("as somebody left it")
+    recording.write_bytes(recording.read_bytes() + b"x")
+    for command, *arguments in (
+        (odometry_command, recording),
+        (volume_command, tmp_path / "map.ply"),
+        (volume_command, tmp_path),
+        (replay_command, tmp_path),
+    ):
+        with pytest.raises(FileFormatError, match="altered"):
+            run(command, *arguments)
+    with pytest.raises(FileFormatError, match=r"(?s)map\.ply: altered.*report\.json: altered"):
+        run(replay_command, tmp_path, "--diff")
+    copy = tmp_path / "elsewhere" / "recording.mcap"
+    copy.parent.mkdir()
+    shutil.copy(recording, copy)
+    assert run(odometry_command, copy)[0] in (0, 1)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"name": "of another program"}'])
+def test_a_manifest_of_another_program_says_nothing_of_a_file_beside_it(capture: Path, content: str) -> None:
+    (capture.parent / "manifest.json").write_text(content)
+    capture.with_suffix(".json").write_text(sensor().to_json_string())
+    assert run(odometry_command, capture)[0] == 0
