@@ -85,31 +85,34 @@ def wall_layer(
     """(N, 2) x and y of the horizontal layer's returns that may be walls, in the levelled frame.
 
     Not those that lie no higher than above_m: floor. Below NO_PILE_ABOVE_M (z_m: height above where it stood) not those of a
-    surface that leans back, by what the layer below sees of it: a pile, whose line moves away as the vehicle climbs. Off the
-    ground (is_climbing) and below LOW_M, where that cannot be told yet, one for each LOW_SPACING_M of width: the foot of a
-    pile close by fills half of the turn, and outvotes the walls.
+    surface that leans back, by what the layers below see of it: a pile, whose line moves away as the vehicle climbs. Two are
+    asked, and have to agree: a wall behind a pile is not one slope with it. Below LOW_M the second sees but the floor.
+
+    Off the ground (is_climbing) and below LOW_M, where the first cannot tell yet either, one return counts for each
+    LOW_SPACING_M of width: the foot of a pile close by fills half of the turn, and outvotes the walls.
     """
     spacing_m = LOW_SPACING_M if is_climbing and z_m < LOW_M else 0.0
-    below = _row_below(geometry.elevation_rad, geometry.horizontal_row) if z_m < NO_PILE_ABOVE_M else -1
-    shape = geometry.directions.shape[1]
+    row = geometry.horizontal_row
+    below, lowest = (_row_below(geometry.elevation_rad, row, n * BELOW_RAD) for n in (1, 2))
+    rows = (row, below, lowest) if z_m < NO_PILE_ABOVE_M else (row, -1, -1)
     return lk.upright_layer(
         levelled.points_level,
         levelled.row,
         levelled.column,
-        geometry.horizontal_row,
-        below,
-        shape,
+        rows,
+        geometry.directions.shape[1],
         above_m,
         noise_m,
         spacing_m,
+        z_m > LOW_M,
     )
 
 
-def _row_below(elevation_rad: Array, row: int) -> int:
-    """The layer whose elevation is nearest to BELOW_RAD under that row's; -1 where none lies half as far under it."""
+def _row_below(elevation_rad: Array, row: int, angle_rad: float) -> int:
+    """The layer whose elevation is nearest to so much under that row's; -1 where none is near it."""
     under = elevation_rad[row] - elevation_rad
-    found = int(np.argmin(np.abs(under - BELOW_RAD)))
-    return found if under[found] > 0.5 * BELOW_RAD else -1
+    found = int(np.argmin(np.abs(under - angle_rad)))
+    return found if abs(under[found] - angle_rad) < 0.5 * BELOW_RAD else -1
 
 
 def range_noise_m(range_m: NDArray[np.float32]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -55,13 +56,33 @@ def on_slope(layer: Array) -> int:
     return int(((layer[:, 1] < -0.5 * FOOT_M) & (np.abs(layer[:, 0]) < 19.0)).sum())
 
 
-@pytest.mark.parametrize("z_m", [1.0, 2.0, 4.0])
-def test_a_slope_beside_the_start_is_no_wall_and_the_walls_are(z_m: float) -> None:
+@pytest.mark.parametrize(
+    ("z_m", "left"), [(1.0, 0.15), (2.0, 0.6), (4.0, 0.4)]
+)  # far along the slope two layers see floor
+def test_a_slope_beside_the_start_is_no_wall_and_the_walls_are(z_m: float, left: float) -> None:
     layer, pile = layer_at(z_m)
     assert len(pile) > 100
-    assert on_slope(layer) < 0.15 * len(pile)
+    assert on_slope(layer) < left * len(pile)
+    assert (np.hypot(*layer.T) < 1.3 * -pile[:, 1].max()).sum() < 0.1 * len(layer)  # none of it close by
     assert (np.abs(layer[:, 1] - 15.0) < 0.6).sum() > 60
     assert (np.abs(layer[:, 0] - 20.0) < 0.6).sum() > 20
+
+
+def test_a_wall_behind_a_pile_is_a_wall() -> None:
+    """The layer below sees the pile before it, nearer than the wall: that is no slope that goes on up to the layer."""
+    z_m, wall_m = 3.0, 5.0  # the pile is 2.1 m high where it meets the wall
+    rng = np.random.default_rng(3)
+    scan, geometry, _ = seen_from(z_m, rng)
+    points = scan.points_level.copy()
+    behind = points[:, 1] < -wall_m
+    points[behind] *= (wall_m / -points[behind, 1])[:, None]
+    points[behind] += 0.01 * rng.standard_normal((behind.sum(), 3))
+    layer = wall_layer(
+        dataclasses.replace(scan, points_level=points), geometry, 0.1 - z_m, z_m, NOISE_M, is_climbing=True
+    )
+    on_wall = np.abs(points[scan.row == 0][:, 1] + wall_m) < 0.2
+    assert on_wall.sum() > 100
+    assert (np.abs(layer[:, 1] + wall_m) < 0.2).sum() > 0.9 * on_wall.sum()
 
 
 def test_on_the_ground_the_foot_of_a_pile_has_no_majority() -> None:
