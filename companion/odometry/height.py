@@ -11,7 +11,7 @@ import numpy as np
 from companion.messages import Array, RangefinderSample
 from companion.odometry import filter as kalman
 from companion.odometry.attitude import AttitudeHistory
-from companion.odometry.height_map import HeightFit, HeightMap
+from companion.odometry.height_map import BEND_SIGMA_RAD, HeightFit, HeightMap
 from companion.odometry.wall_map import WallMap
 
 BLOCK_SIGMA_RATIO = 0.5  # means of blocks of about four returns
@@ -111,6 +111,32 @@ class HeightTracker:
             seen_spread_m=self._highest_m,
             tilt_information=np.asarray(np.linalg.inv(self._tilt_p), np.float64),
             shift_information=np.asarray(np.linalg.inv(shift), np.float64),
+        )
+
+    def shift_along(
+        self,
+        lower: Array,
+        planar: kalman.Planar,
+        vertical: kalman.Vertical,
+        walls: WallMap,
+        sigma_m: float,
+        axis: Array,
+        tilt: Array,
+    ) -> tuple[float, float]:
+        """How far the body is off along axis, (2,) in map, by the slopes of the ground, and the information about that; after
+        `update` of the same scan, which found its tilt (2,)."""
+        sigma_z = math.sqrt(float(vertical.p[0, 0]))
+        return self.ground.shift_along(
+            lower,
+            planar.x[kalman.POSE],
+            float(vertical.x[0]),
+            walls,
+            axis,
+            tilt=tilt,
+            variances=np.append(sigma_z**2, np.diag(self._tilt_p) + BEND_SIGMA_RAD**2),
+            sigma_range_m=BLOCK_SIGMA_RATIO * sigma_m,
+            gate_m=0.5 + 3.0 * sigma_z,
+            seen_spread_m=self._highest_m,
         )
 
     def update(

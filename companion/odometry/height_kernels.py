@@ -28,6 +28,8 @@ UNKNOWN, GROUND, WALL = 0, 1, 2
 WALL_FOOT_M = 0.7  # a wall point must be this far above the ground to count as one
 WALL_GATE_M = 0.5
 WALL_SPREAD_M = 1.0  # of heights at which a wall must have been seen to count as plumb
+MIN_SHIFT_POINTS = 50
+LEAST_SLOPE = 0.25  # along the axis: the floor's noise looks like less, and would tell of places that nobody knows
 BESIDE_M = 1.2  # where the ground at a wall's foot is not known, it is looked for this far before the wall
 
 
@@ -352,3 +354,44 @@ def fit_height(
         correction[0] = height[0]
         information[0, 0] = without(h + slope_prior, 1)[0, 0]
     return correction, information, out
+
+
+@kernel
+def shift_along(
+    planes: Array,
+    points: Array,
+    pose: Array,
+    z_m: float,
+    tilt: Array,
+    axis: Array,
+    kind: NDArray[np.int64],
+    place: NDArray[np.int64],
+    sigma_range_m: float,
+    variances: Array,
+    iterations: int,
+) -> tuple[float, float]:
+    """How far along a level axis (2,) of `map` the body is off, by the flanks of the ground that is known; and the information
+    about that, with z, roll and pitch, of those variances (3,), left free beside it. 0 where too few points tell."""
+    flat = planes.reshape(-1, PLANE)
+    rows, res, var, _ = _ground_rows(planes, points, pose, z_m, tilt, kind, place, sigma_range_m)
+    if len(res) < MIN_SHIFT_POINTS:
+        return 0.0, 0.0
+    jac = np.zeros((len(res), 4))
+    jac[:, 1:] = rows
+    k, sloping = 0, 0
+    for i in range(points.shape[0]):
+        if kind[i] == GROUND and place[i] >= 0:
+            p = flat[place[i]]
+            slope = p[BX] * axis[0] + p[BY] * axis[1]
+            if abs(slope) > LEAST_SLOPE:
+                jac[k, 0] = -slope
+                sloping += 1
+            k += 1
+    if sloping < MIN_SHIFT_POINTS:
+        return 0.0, 0.0
+    prior = np.zeros((4, 4))
+    prior[0, 0] = 1e-6
+    for j in range(3):
+        prior[1 + j, 1 + j] = 1.0 / variances[j]
+    moved, h, _ = _solve_robustly(jac, res, var, prior, iterations)
+    return float(moved[0]), max(float(without(h + prior, 1)[0, 0]), 0.0)

@@ -74,28 +74,7 @@ class HeightMap:
         gate_m: how far a point may be off the known ground. seen_spread_m: range of heights flown through so far.
         tilt_information, shift_information: (2, 2) of roll and pitch, and of x and y, as they were used.
         """
-        if len(points_level) > MAX_POINTS:
-            points_level = points_level[:: -(-len(points_level) // MAX_POINTS)]
-        n = len(points_level)
-        kind: NDArray[np.int64] = np.zeros(n, np.int64)
-        place: NDArray[np.int64] = np.zeros(n, np.int64)
-        min_spread = min(0.6, 0.5 * seen_spread_m)
-        standing = walls.lines_at(points_level, pose)
-        hk.classify(
-            self.sums,
-            self.state,
-            self.planes,
-            self.origin,
-            self.cell_m,
-            standing,
-            points_level,
-            pose,
-            z_m,
-            gate_m,
-            min_spread,
-            kind,
-            place,
-        )
+        points_level, standing, kind, place = self._told_apart(points_level, pose, z_m, walls, gate_m, seen_spread_m)
         correction, information, out = hk.fit_height(
             self.planes,
             standing,
@@ -119,6 +98,55 @@ class HeightMap:
             map_variance=float(out[3]),
             new_ground=points_level[kind == hk.GROUND],
         )
+
+    def shift_along(
+        self,
+        points_level: Array,
+        pose: Array,
+        z_m: float,
+        walls: WallMap,
+        axis: Array,
+        *,
+        tilt: Array,
+        variances: Array,
+        sigma_range_m: float,
+        gate_m: float,
+        seen_spread_m: float,
+    ) -> tuple[float, float]:
+        """How far the body is off along axis, (2,) in map, m, by the slopes of the ground; and the information about it, 1/m2.
+
+        tilt: (2,) roll and pitch that the points are still off by. variances: (3,) of z, roll, pitch. The rest as of `fit`.
+        """
+        points, _, kind, place = self._told_apart(points_level, pose, z_m, walls, gate_m, seen_spread_m)
+        return hk.shift_along(self.planes, points, pose, z_m, tilt, axis, kind, place, sigma_range_m, variances, 4)
+
+    def _told_apart(
+        self, points_level: Array, pose: Array, z_m: float, walls: WallMap, gate_m: float, seen_spread_m: float
+    ) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
+        """The points that are used, the walls at them, what each is and on which plane: see height_kernels.classify."""
+        if len(points_level) > MAX_POINTS:
+            points_level = points_level[:: -(-len(points_level) // MAX_POINTS)]
+        n = len(points_level)
+        kind: NDArray[np.int64] = np.zeros(n, np.int64)
+        place: NDArray[np.int64] = np.zeros(n, np.int64)
+        min_spread = min(0.6, 0.5 * seen_spread_m)
+        standing = walls.lines_at(points_level, pose)
+        hk.classify(
+            self.sums,
+            self.state,
+            self.planes,
+            self.origin,
+            self.cell_m,
+            standing,
+            points_level,
+            pose,
+            z_m,
+            gate_m,
+            min_spread,
+            kind,
+            place,
+        )
+        return points_level, standing, kind, place
 
     def height_at(self, x_m: float, y_m: float) -> tuple[float, float] | None:
         """Ground height and its variance at a place, or None where it is not known."""

@@ -196,6 +196,8 @@ class Odometry:
             self.height.is_standing = self._standstill.is_standing
             vertical, fit = self.height.update(lower, planar, vertical, history, self.walls, self._sigma_range_m)
             ground = fit.new_ground
+            if judgement.is_degenerate and self._is_released:
+                planar = self._hold_by_ground(planar, vertical, judgement.weak_axis, lower, fit.correction[1:])
             if not self._is_released:
                 planar, vertical = self._stand(
                     history, planar, vertical, registration, judgement, fit.correction[0], fit.z_sigma_m
@@ -337,6 +339,17 @@ class Odometry:
             self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
         self._is_weak, self._is_lost = True, weak.sigma_along(planar, axis) > weak.LOST_M
         return planar, registration, judgement, False
+
+    def _hold_by_ground(
+        self, planar: kalman.Planar, vertical: kalman.Vertical, axis: Array, lower: Array, tilt: Array
+    ) -> kalman.Planar:
+        """Where walls do not hold the place along an axis, a pile in sight does. It stays degenerate all the same: nothing
+        holds the tilt along that axis, and heights drift."""
+        noise = self._sigma_range_m
+        moved_m, information = self.height.shift_along(lower, planar, vertical, self.walls, noise, axis, tilt)
+        planar = weak.held_by_ground(planar, axis, moved_m, information)
+        self._is_lost = weak.sigma_along(planar, axis) > weak.LOST_M
+        return planar
 
     def _is_misplaced(
         self, registration: Registration, layer: Array, guess: Array, covariance: Array, z_m: float

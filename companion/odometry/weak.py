@@ -24,6 +24,10 @@ FLYING_SIGMA_M = 0.1  # what it moved meanwhile: from one scan to the next
 AXIS_MEMORY = 0.97  # of the information that tells the axis, from scan to scan
 AXIS_SIGMA_RAD = 0.01  # of its direction: what is unknown along it is unknown across it by so much
 HELD_SIGMA_M = 1e-4
+GROUND_SIGMA_M = 0.05  # along the axis, by slopes: the ground's map errs too
+GROUND_SIGMA_MOST_M = 0.2
+GROUND_SIGMAS = 4.0
+MOST_MOVED_M = 0.3
 QUALITY_M = 0.1  # sigma up to which quality is not cut
 STEP_M = 0.5  # of the search; less than the gate of a registration
 MAX_SEARCH_M = 15.0
@@ -79,6 +83,19 @@ def in_flight(state: Planar, axis: Array) -> Planar:
     p[:2, :2] += np.outer(axis, axis) * FLYING_SIGMA_M**2
     p[2:4, 2:4] += np.outer(axis, axis) * FLYING_SIGMA_MPS**2
     return Planar(state.t_ns, state.x, p)
+
+
+def held_by_ground(state: Planar, axis: Array, moved_m: float, information: float) -> Planar:
+    """With what the slopes of the ground tell of the place along the axis; as it was where that is little, or not believed."""
+    if information < 1.0 / GROUND_SIGMA_MOST_M**2:
+        return state
+    variance = 1.0 / information + GROUND_SIGMA_M**2
+    toward = state.p[:, :2] @ axis
+    total = float(axis @ toward[:2]) + variance
+    if abs(moved_m) > max(MOST_MOVED_M, GROUND_SIGMAS * np.sqrt(total)):
+        return state
+    p = state.p - np.outer(toward, toward) / total
+    return Planar(state.t_ns, state.x + toward * (moved_m / total), 0.5 * (p + p.T))
 
 
 def axis_variance(sigma_m: float) -> Array:

@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from companion.messages import RangefinderSample
+from companion.odometry import filter as kalman
+from companion.odometry import weak
 from companion.odometry.height import HeightTracker
 from companion.odometry.height_map import HeightMap
 from companion.odometry.level import range_noise_m
+from companion.odometry.wall_map import WallMap
 
 SENSOR_UP_M = 0.25
 SENSOR = np.array([0.0, 0.0, SENSOR_UP_M])
@@ -113,3 +116,56 @@ def test_few_noisy_returns_give_planes_that_points_can_have() -> None:
         ground.insert(points, np.zeros(3), SENSOR, 0.6, 0.0)
         known = [ground.height_at(x, y) for x, y in points[:, :2]]
         assert all(math.isfinite(height[0]) and height[1] > 0.0 for height in known if height is not None)
+
+
+def cone_map(seed: int) -> HeightMap:
+    """A heap of 4 m with flanks of 34 deg, 12 m ahead, on a level floor, seen well."""
+    rng = np.random.default_rng(seed)
+    ground = HeightMap()
+    for _ in range(40):
+        sight = heap(rng, 0.0)
+        ground.insert(sight, np.array([0.0, 0.0, 8.0]), np.zeros(3), 0.12, 1e-6)
+    return ground
+
+
+def heap(rng: np.random.Generator, shift_m: float, height_m: float = 4.0) -> np.ndarray:
+    """(600, 4) block means of the lower layers, in the levelled frame 8 m up, the body shift_m farther along x than it thinks."""
+    xy = rng.uniform([2.0, -10.0], [22.0, 10.0], (600, 2))
+    z = np.maximum(height_m - 0.67 * np.hypot(xy[:, 0] - 12.0, xy[:, 1]), 0.0) + 0.03 * rng.standard_normal(600)
+    return np.column_stack([xy[:, 0] - shift_m, xy[:, 1], z - 8.0, np.full(600, 4.0)])
+
+
+def shift_of(ground: HeightMap, points: np.ndarray, axis: tuple[float, float]) -> tuple[float, float]:
+    return ground.shift_along(
+        points, np.zeros(3), 8.0, WallMap(), np.array(axis), tilt=np.zeros(2), variances=np.array([1e-3, 1e-5, 1e-5]),
+        sigma_range_m=0.06, gate_m=0.6, seen_spread_m=8.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("shift_m", [-0.3, 0.0, 0.2])
+def test_a_pile_tells_where_the_body_is_along_a_hall(shift_m: float) -> None:
+    moved_m, information = shift_of(cone_map(1), heap(np.random.default_rng(2), shift_m), (1.0, 0.0))
+    assert moved_m == pytest.approx(shift_m, abs=0.04)
+    assert 1.0 / 0.2**2 < information < 1.0 / 0.005**2
+
+
+def test_a_level_floor_tells_nothing_of_the_place() -> None:
+    rng = np.random.default_rng(3)
+    ground = HeightMap()
+    for _ in range(40):
+        ground.insert(heap(rng, 0.0, height_m=0.0), np.array([0.0, 0.0, 8.0]), np.zeros(3), 0.12, 1e-6)
+    moved_m, information = shift_of(ground, heap(rng, 0.3, height_m=0.0), (1.0, 0.0))
+    state = kalman.Planar(0, np.zeros(8), np.diag([0.25] * 8))
+    held = weak.held_by_ground(state, np.array([1.0, 0.0]), moved_m, information)
+    assert abs(held.x[0]) < 0.05
+
+
+def test_what_the_ground_tells_narrows_that_axis_only_and_is_not_believed_when_it_contradicts() -> None:
+    axis = np.array([0.6, 0.8])
+    state = kalman.Planar(0, np.zeros(8), np.diag([0.04, 0.04, 0.1, 0.1, 0.1, 0.1, 1e-4, 1e-4]))
+    held = weak.held_by_ground(state, axis, 0.2, 2500.0)
+    assert axis @ held.x[:2] == pytest.approx(0.2, abs=0.03)
+    assert weak.sigma_along(held, axis) < 0.06
+    assert weak.sigma_along(held, np.array([-0.8, 0.6])) == pytest.approx(0.2)
+    assert weak.held_by_ground(state, axis, 2.0, 2500.0) is state
+    assert weak.held_by_ground(state, axis, 0.2, 4.0) is state
