@@ -225,7 +225,8 @@ class Flight:
         """The volume from the map so far: seconds of work."""
         from companion.volume import estimate_volume  # not before: what it needs of scipy takes a second to load
 
-        return estimate_volume(self.mapper.point_map(), self.config.volume)
+        cut_short = self.navigation is not None and not self.navigation.lap_closed
+        return estimate_volume(self.mapper.point_map(), self.config.volume, is_cut_short=cut_short)
 
     # ---- within -----------------------------------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from companion.topics import TOPICS, Topic
+from companion.topics import SCAN, TOPICS, Topic
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "dataflow.md"
 BEGIN, END = "<!-- topics: begin (make docs) -->", "<!-- topics: end -->"
@@ -15,7 +15,7 @@ def _row(topic: Topic) -> str:
     rate = f"{topic.rate_hz:g} Hz" if topic.rate_hz else "on change"
     queue = "newest only" if topic.queue == 1 else f"{topic.queue}, drops the oldest"
     stale = f"{topic.stale_after_s:g} s" if topic.stale_after_s is not None else "never"
-    recorded = "yes" if topic.recorded else "no"
+    recorded = "as its packets" if topic is SCAN else "yes" if topic.recorded else "no"
     sinks = ", ".join(topic.sinks)
     return f"| `{topic.name}` | {topic.message.__name__} | {topic.source} | {sinks} | {rate} | {queue} | {stale} | {recorded} |"
 

@@ -24,9 +24,9 @@ from companion.messages import Event, PointMap, Severity, VolumeReport
 from companion.recording.log import Recorder
 from companion.recording.manifest import write_manifest
 from companion.telemetry.mqtt import Telemetry
-from companion.topics import EVENT, Topic
+from companion.topics import EVENT, VOLUME, Topic
 from companion.warm_up import warm_up
-from stockpilot.files import volume_keys, write_json, write_trajectory
+from stockpilot.files import fresh_folder, volume_keys, write_json, write_trajectory
 from stockpilot.mission import Mission, load_mission
 from stockpilot.recorded import listen, open_recorder
 from stockpilot.telemetry import DELIVERY_S, mqtt_task, mqtt_telemetry
@@ -42,9 +42,11 @@ def fly_command(
     """Exit code: 0 completed, 1 not."""
     mission = load_mission(path, settings, with_world=False)
     metadata = _read_metadata(lidar_metadata)
-    folder = out or Path("runs") / f"{mission.name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    folder.mkdir(parents=True, exist_ok=True)
+    asked = out or Path("runs") / f"{mission.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    folder = fresh_folder(asked)
     console = Console(stderr=True)
+    if folder != asked:
+        console.print(f"[bold yellow]{asked} holds a flight already: this one is recorded in {folder}[/]")
     key_file = mission.companion.mavlink.signing_key_file
     signer = open_signer(Path(key_file)) if key_file is not None else None
     flight = Flight(config=mission.companion, lidar_metadata_json=metadata, signer=signer)
@@ -55,7 +57,7 @@ def fly_command(
     _tell_events(flight, console)
     app = App(flight=flight, connect=connect, lidar=lidar, on_sent=recorder.output if recorder else None)
     app.housekeeping = _housekeeping(recorder, flight, folder)
-    spool = folder / "mqtt"
+    spool = asked / "mqtt"  # what an earlier start could not deliver waits there
     if mission.companion.telemetry.mqtt_url is not None:
         app.telemetry = mqtt_task(mqtt_telemetry(mission.companion.telemetry, flight, spool), flight)
     console.print("warming up (half a minute the first time on a computer) ...", style="dim")
@@ -65,12 +67,14 @@ def fly_command(
         asyncio.run(
             app.run(ready=lambda: console.print(f"listening on {connect} and {lidar}; Ctrl-C lands the vehicle"))
         )
+        report = flight_report(mission, flight, app, time.monotonic() - began)
+        console.print("measuring ...", style="dim")
+        volume = flight.measure() if flight.mapper.size else None
+        if recorder is not None and volume is not None:
+            recorder.tap(VOLUME, time.monotonic_ns(), volume)
     finally:
         if recorder is not None:
             recorder.close(_outcome(flight))
-    report = flight_report(mission, flight, app, time.monotonic() - began)
-    console.print("measuring ...", style="dim")
-    volume = flight.measure() if flight.mapper.size else None
     report.update(volume_keys(volume))
     _write(folder, flight, report, volume)
     if app.telemetry is not None:

@@ -10,14 +10,14 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.lidar.ouster import OusterDecoder
 from companion.lidar.pcap import PcapReader
 from companion.recording import manifest
 from companion.recording.mcap_read import Attachment, Message, Metadata, open_mcap
+from companion.recording.recover import RECOVERED
 from companion.recording.run_files import read_run
 from companion.recording.tlog import read_tlog
 from stockpilot.file_kinds import FileKind, file_kind
-from stockpilot.scan_files import carmen_lines, metadata_beside, open_bag
+from stockpilot.scan_files import carmen_lines, decoder_of, metadata_beside, open_bag
 
 GAP_FACTOR = 5.0  # a gap this many times the usual interval of a steady stream is told
 GAP_LEAST_NS = 500_000_000
@@ -159,7 +159,9 @@ def _read_mcap(found: Contents) -> None:
             found.stream(item.channel.topic, kind).add(item.t_ns, len(item.data))
         elif isinstance(item, Metadata):
             values = {k: v for k, v in item.values.items() if len(v) <= 200}
-            if item.name == "recorder":
+            if item.name == RECOVERED:
+                found.problems += [f"lost before it was recovered, {where}: {what}" for where, what in values.items()]
+            elif item.name == "recorder":
                 found.drops.update({f"recorder: {k}": int(v) for k, v in values.items() if v.isdigit()})
             else:
                 found.labels.update({k if item.name == "run" else f"{item.name} {k}": v for k, v in values.items()})
@@ -180,7 +182,7 @@ def _read_packed(found: Contents) -> None:
 def _read_pcap(found: Contents) -> None:
     reader = PcapReader(found.path)
     metadata = metadata_beside(found.path)
-    decoder = None if metadata is None else OusterDecoder(metadata.read_text(encoding="utf-8"))
+    decoder = None if metadata is None else decoder_of(metadata)
     scans = Stream("scans (Ouster)", "LidarScan")
     for packet in reader:
         found.stream(f"udp {packet.destination[1]}", f"{len(packet.data)} byte datagrams").add(

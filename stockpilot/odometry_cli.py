@@ -18,6 +18,7 @@ from companion.messages import Array, PointMap
 from companion.odometry.loop_closure import LoopCloser
 from companion.odometry.planar import PlanarMatcher
 from companion.recording.tum import seconds
+from stockpilot.files import require_place
 from stockpilot.scan_files import FileScan, ScanFile, open_scans
 
 MAP_EVERY_M = 0.3  # a scan goes into the map when the scanner has moved this far or turned this much
@@ -127,10 +128,18 @@ def odometry_command(
 
     Exit codes: 0 all well, 1 fewer than half the scans could be placed, 2 not a recording with scans.
     """
+    for path in (tum, map_out):
+        if path is not None:
+            require_place(path)
+    if map_out is not None:
+        from companion.mapping.export import map_writer
+
+        map_writer(map_out)
     opened = open_scans(file, metadata=metadata, topic=topic)
     found = track(opened.scans, with_map=map_out is not None, with_loops=loops)
     if not found.t_ns:
-        raise FileFormatError(f"{file}: no whole scan in it")
+        lost = ", ".join(f"{n} dropped: {why}" for why, n in opened.dropped.items() if n)
+        raise FileFormatError(f"{file}: no whole scan of {opened.sensor} in it{f' ({lost})' if lost else ''}")
     said = summary(file, opened, found)
     if tum is not None:
         _write_text(tum, "".join(found.tum()))

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Self
 import yaml
 
 from companion.flight import Flight
-from companion.messages import LevelledScan
+from companion.messages import LevelledScan, VolumeReport
 from companion.recording.log import Recorder
-from companion.topics import Topic
+from companion.topics import VOLUME, Topic
 from stockpilot.mission import Mission
 
 if TYPE_CHECKING:  # needs the emulated side
@@ -84,6 +84,11 @@ class LockstepRecorder:
         )  # fmt: skip
         listen(self._recorder, runner.flight)
         runner.on_output = self._recorder.output
+
+    def volume(self, report: VolumeReport | None) -> None:
+        """What the flight was flown for, measured after it."""
+        if report is not None and self._recorder is not None and self._runner is not None:
+            self._recorder.tap(VOLUME, self._runner.t_ns, report)
 
     def __enter__(self) -> Self:
         return self

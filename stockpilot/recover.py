@@ -8,8 +8,10 @@ from typing import Annotated
 
 import typer
 
+from companion.errors import FileFormatError
 from companion.recording.recover import Recovery, recover
 from companion.recording.run_files import recording_path
+from stockpilot.file_kinds import FileKind, file_kind
 
 EXIT_WHOLE, EXIT_NOTHING, EXIT_LOSS = 0, 1, 3
 
@@ -42,8 +44,20 @@ def as_dict(found: Recovery) -> dict[str, object]:
         "bytes": found.bytes_total,
         "bytes_lost": found.bytes_lost,
         "messages_of_unknown_channels": found.orphans,
+        "why_nothing": other_kind(found) if found.is_empty and not found.is_whole else [],
         "damage": [{"offset": d.offset, "bytes": d.bytes_lost, "what": d.what} for d in found.damage],
     }
+
+
+def other_kind(found: Recovery) -> list[str]:
+    """Why there is nothing in it, where the file is no MCAP at all."""
+    if not found.bytes_total:
+        return ["it is empty"]
+    try:
+        kind, _ = file_kind(found.path)
+    except FileFormatError:
+        return []
+    return [] if kind is FileKind.MCAP else [f"it is a {kind.value}: only MCAP is rebuilt"]
 
 
 def describe(found: Recovery) -> str:
@@ -52,8 +66,10 @@ def describe(found: Recovery) -> str:
     if found.is_whole:
         return f"{found.path}: whole, {found.messages} messages; nothing to do"
     lines = [f"{found.path}: {'nothing can be read' if found.is_empty else 'damaged'}"]
+    if found.is_empty:
+        lines += [f"  {line}" for line in other_kind(found)]
     lines += [f"  at byte {d.offset}: {d.what} ({d.bytes_lost} bytes not read)" for d in found.damage]
-    if not found.damage:
+    if not found.damage and found.bytes_total:
         lines.append("  the end is missing: it was not closed")
     if found.output is not None:
         duration = said["duration_s"]

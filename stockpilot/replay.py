@@ -20,12 +20,16 @@ from companion.errors import ConfigError, FileFormatError
 from companion.flight import Flight
 from companion.messages import OdometryEstimate, VolumeReport
 from companion.odometry import ScanResult
-from companion.recording import ahead
+from companion.recording import ahead, codec
 from companion.recording.manifest import require_unaltered
+from companion.recording.recover import RECOVERED
 from companion.recording.replay import Replay, TopicDifference, compare
 from companion.recording.run_files import RunRecording, read_run, recording_path
 from companion.recording.tum import tum_line
+from companion.topics import VOLUME
+from stockpilot.files import finite, make_folder, write_json
 from stockpilot.mission import parse_setting
+from stockpilot.replay_edit import rebuild_scans
 
 EXIT_DIFFERENT = 1
 BESIDE = ("keyframes", "volume_m3", "volume_interval_m3", "seen_ratio")  # of the run's own report, set beside a new one
@@ -61,8 +65,11 @@ def replay_run(path: Path, settings: Sequence[str] = (), *, keep_messages: bool 
     require_unaltered(file.parent, [file.name])
     recording = read_run(file, with_topics=keep_messages)
     config = recorded_config(recording, settings)
-    metadata = recording.attachments.get("lidar.json")
-    flight = Flight(config=config, lidar_metadata_json=None if metadata is None else metadata.decode())
+    lidar = recording.attachments.get("lidar.json")
+    metadata = None if lidar is None else lidar.decode()
+    if metadata is not None and not any(item.kind == "begin" for item in recording.inputs):
+        recording.inputs = rebuild_scans(recording.inputs, metadata)  # packed recordings leave them out
+    flight = Flight(config=config, lidar_metadata_json=metadata)
     estimates: list[OdometryEstimate] = []
 
     def take(result: ScanResult) -> None:
@@ -122,10 +129,18 @@ def replay_command(
 
     Exit codes: 0 all well (with --diff: no difference), 1 --diff found differences, 2 not a recording, or altered.
     """
-    again = replay_run(run, settings or (), keep_messages=diff)
+    if out is not None:
+        make_folder(out)
     folder = recording_path(run).parent
+    if diff or report:
+        require_unaltered(folder, ["map.ply", "report.json"])  # it is set beside them
+    again = replay_run(run, settings or (), keep_messages=diff)
     left = left_behind(folder) if diff else {}
-    volume = again.flight.measure() if report or out is not None or "volume_m3" in left else None
+    measured = again.recording.topics.get(VOLUME.name, [])
+    wanted = report or out is not None or "volume_m3" in left or bool(measured)
+    volume = again.flight.measure() if wanted and again.flight.mapper.size else None
+    if volume is not None and measured:
+        again.replay.messages[VOLUME.name] = [(t_ns, codec.encode(volume)) for t_ns, _ in measured]
     said = summary(again, volume)
     if report:
         said["recorded"] = told_by_run(folder)
@@ -138,7 +153,7 @@ def replay_command(
         said["identical"] = all(d.first is None for d in differences)
     if out is not None:
         write_results(out, again, said)
-    typer.echo(json.dumps(said, indent=2) if as_json else describe(said))
+    typer.echo(json.dumps(finite(said), indent=2) if as_json else describe(said))
     raise typer.Exit(EXIT_DIFFERENT if any(d.first for d in differences) else 0)
 
 
@@ -149,7 +164,7 @@ def left_behind(folder: Path) -> dict[str, Any]:
         found["map.ply"] = (folder / "map.ply").read_bytes()
     with contextlib.suppress(OSError, ValueError):
         report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        if isinstance(report.get("volume_m3"), float):
+        if isinstance(report, dict) and isinstance(report.get("volume_m3"), float):
             found["volume_m3"] = report["volume_m3"]
     return found
 
@@ -175,9 +190,9 @@ def compare_results(left: dict[str, Any], again: Replayed, volume: VolumeReport 
             data = path.read_bytes()
         first = None if data == left["map.ply"] else f"{len(left['map.ply'])} bytes, now {len(data)} others"
         found.append(TopicDifference("map.ply", 1, 1, first))
-    if "volume_m3" in left and volume is not None:
-        same = volume.volume_m3 == left["volume_m3"]
-        first = None if same else f"{left['volume_m3']!r} m3, now {volume.volume_m3!r}"
+    if "volume_m3" in left:
+        now = None if volume is None else volume.volume_m3
+        first = None if now == left["volume_m3"] else f"{left['volume_m3']!r} m3, now {now!r}"
         found.append(TopicDifference("report.json volume_m3", 1, 1, first))
     return found
 
@@ -198,6 +213,7 @@ def summary(again: Replayed, volume: VolumeReport | None = None) -> dict[str, An
         "lidar_dropped": {k: n for k, n in flight.decoder.dropped.items() if n},
         "state": None if navigation is None else navigation.state.value,
         "is_whole": again.recording.is_whole,
+        "lost": again.recording.damage + [f"{k}: {v}" for k, v in again.recording.metadata.get(RECOVERED, {}).items()],
     }
     if estimates:
         last = estimates[-1]
@@ -205,6 +221,8 @@ def summary(again: Replayed, volume: VolumeReport | None = None) -> dict[str, An
         said["final_sigma_m"] = float(last.pose_covariance[:2, :2].trace() ** 0.5)
     if again.replay.unmatched:
         said["unmatched"] = again.replay.unmatched
+    if not flight.mapper.size:
+        said["warnings"] = ["nothing was mapped"]
     if volume is not None:
         said |= {
             "volume_m3": volume.volume_m3,
@@ -220,10 +238,20 @@ def summary(again: Replayed, volume: VolumeReport | None = None) -> dict[str, An
 def write_results(folder: Path, again: Replayed, said: dict[str, Any]) -> None:
     from companion.mapping.export import save_point_map
 
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     save_point_map(again.flight.mapper.point_map(), folder / "map.ply")
     (folder / "trajectory.tum").write_text("".join(tum_line(e) for e in again.estimates), encoding="utf-8")
-    (folder / "report.json").write_text(json.dumps(said, indent=2) + "\n", encoding="utf-8")
+    write_json(folder / "report.json", said)
+
+
+def _span(interval_m3: list[float | None]) -> str:
+    """high: None or infinite where a flight was cut short."""
+    low, high = interval_m3
+    return (
+        f"interval {low or 0.0:.2f} to {high:.2f}"
+        if high is not None and high < float("inf")
+        else f"at least {low or 0.0:.2f}"
+    )
 
 
 def _beside(recorded: dict[str, Any]) -> str:
@@ -231,8 +259,7 @@ def _beside(recorded: dict[str, Any]) -> str:
     if "volume_m3" in recorded:
         parts.append(f"volume {recorded['volume_m3']:.2f} m3")
     if "volume_interval_m3" in recorded:
-        low, high = recorded["volume_interval_m3"]
-        parts.append(f"interval {low:.2f} to {high:.2f}")
+        parts.append(_span(recorded["volume_interval_m3"]))
     if "seen_ratio" in recorded:
         parts.append(f"seen {recorded['seen_ratio']:.1%}")
     if "keyframes" in recorded:
@@ -249,15 +276,14 @@ def describe(said: dict[str, Any]) -> str:
         f"degenerate {said['degenerate_scans']}, ended in {said['state']}",
     ]
     if "volume_m3" in said:
-        low, high = said["volume_interval_m3"]
-        lines.append(
-            f"volume {said['volume_m3']:.2f} m3, interval {low:.2f} to {high:.2f}, seen {said['seen_ratio']:.1%}"
-        )
-        lines += [f"  {w}" for w in said["warnings"]]
+        span = _span(said["volume_interval_m3"])
+        lines.append(f"volume {said['volume_m3']:.2f} m3, {span}, seen {said['seen_ratio']:.1%}")
+    lines += [f"  {w}" for w in said.get("warnings", [])]
     if said.get("recorded"):
         lines.append(f"the run itself told {_beside(said['recorded'])}")
     if not said["is_whole"]:
         lines.append("the recording is not whole: stockpilot recover rebuilds it")
+    lines += [f"  lost {what}" for what in said["lost"]]
     for d in said.get("differences", []):
         lines.append(f"  {'differs' if d['first'] else 'same   '}  {d['topic']}: {d['first'] or d['recorded']}")
     if "identical" in said:

@@ -123,6 +123,10 @@ def _bounds(report: Mapping[str, Any]) -> tuple[float, float] | None:
 def _interval_text(report: Mapping[str, Any]) -> str:
     bounds = _bounds(report)
     level = 100 * float(report.get("volume_interval_level") or 0.95)
+    if bounds is None and report.get("volume_m3") is not None and (pair := report.get("volume_interval_m3")):
+        return (
+            f"at least {_number(pair[0], 1, 'm³')} ({level:g} % confidence): nobody knows how much lies beyond the map"
+        )
     if bounds is None:
         return "no interval: the map does not tell how wrong the number may be"
     low, high = bounds

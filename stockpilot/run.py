@@ -20,6 +20,7 @@ from simbridge.autopilot import Autopilot
 from simbridge.config import SimConfig
 from simbridge.loop import Simulation
 from simbridge.world import World
+from stockpilot.files import begin_folder
 from stockpilot.lockstep import Lockstep, Outcome, Wire
 from stockpilot.mission import Mission, load_mission
 from stockpilot.results import Scored, score_flight
@@ -112,8 +113,7 @@ def run_command(
 
     mission = load_mission(path, settings, seed=seed)
     autopilot = autopilot or mission.autopilot
-    folder = out or Path("runs") / f"{mission.name}-{mission.seed}"
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = begin_folder(out or Path("runs") / f"{mission.name}-{mission.seed}")
     console = Console(stderr=True)
     console.print("warming up (a minute the first time on a computer) ...", style="dim")
     warm_up(mission.companion)
@@ -131,6 +131,8 @@ def run_command(
             stack.enter_context(_signals_abort(runner, console))
 
         flown = fly_lockstep(mission, autopilot=autopilot, binary=binary, progress=show, attach=attach)
+        if recorder is not None:
+            recorder.volume(flown.scored.volume)
     console.print("measuring and drawing ...", style="dim")
     write_results(folder, flown)
     if as_json:

@@ -22,12 +22,14 @@ from companion.lidar.ouster import OusterDecoder
 from companion.lidar.pcap import PcapReader
 from companion.messages import Array, LidarScan
 from companion.recording import channels
+from companion.recording.manifest import require_unaltered_file
 from companion.recording.mcap_read import Attachment, McapScan, Message, open_mcap
 from stockpilot.file_kinds import FileKind, file_kind
 
 HORIZONTAL_BAND_RAD = math.radians(1.5)  # of a 3D scan, what is nearer to the horizon than this makes the planar scan
 LASER_TYPES = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2")
 VELODYNE_PORT = 2368
+CUT = "what follows: the file is cut or broken"
 _SICK_BEAMS, _SICK_STEP_RAD = 180, math.radians(1.0)
 
 
@@ -58,9 +60,10 @@ def open_scans(path: Path, *, metadata: Path | None = None, topic: str | None = 
 
     Args:
         metadata: an Ouster sensor's JSON; default: the one beside the capture. topic: of several, which.
-    Raises: FileFormatError: not a recording, or there are no scans in it.
+    Raises: FileFormatError: not a recording, there are no scans in it, or it is of a run and was altered since.
     """
     kind, file = file_kind(path)
+    require_unaltered_file(file)
     if kind is FileKind.PCAP:
         return _open_capture(file, metadata)
     if kind is FileKind.MCAP:
@@ -123,13 +126,24 @@ def metadata_beside(path: Path) -> Path | None:
     return near[-1] if near else None
 
 
+def decoder_of(metadata: Path) -> OusterDecoder:
+    """For the sensor that a metadata JSON describes. Raises: FileFormatError: it cannot be read, or is none; it is named."""
+    try:
+        text = metadata.read_text(encoding="utf-8")
+    except OSError as error:
+        raise FileFormatError(f"{metadata}: the LiDAR's metadata cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{metadata}: the LiDAR's metadata is no text: {error}") from None
+    try:
+        return OusterDecoder(text)
+    except FileFormatError as error:
+        raise FileFormatError(f"{metadata}: {error}") from None
+
+
 def _open_capture(path: Path, metadata: Path | None) -> ScanFile:
     found = metadata or metadata_beside(path)
     if found is not None:
-        try:
-            decoder = OusterDecoder(found.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError) as error:
-            raise FileFormatError(f"{found}: the LiDAR's metadata cannot be read: {error}") from None
+        decoder = decoder_of(found)
         sensor = f"{decoder.info.prod_line}, {decoder.info.h} x {decoder.info.w}"
         return ScanFile(kind=FileKind.PCAP, sensor=sensor, scans=_ouster_scans(path, decoder), dropped=decoder.dropped)
     if any(p.destination[1] == VELODYNE_PORT or len(p.data) == 1206 for p in _first(PcapReader(path), 50)):
@@ -147,9 +161,12 @@ def _first(packets: PcapReader, count: int) -> Iterator[Any]:
 
 
 def _ouster_scans(path: Path, decoder: OusterDecoder) -> Iterator[FileScan]:
-    for packet in PcapReader(path):
+    reader = PcapReader(path)
+    for packet in reader:
         for scan in decoder.receive(packet.data, packet.t_ns, packet.source):
             yield scan_from_lidar(scan, decoder)
+    if reader.is_cut:
+        decoder.dropped[CUT] = 1
 
 
 def _velodyne_scans(path: Path) -> Iterator[FileScan]:
@@ -179,21 +196,30 @@ def _open_mcap(path: Path, topic: str | None) -> ScanFile:
         decoder = OusterDecoder(metadata)
         scans = _own_scans(path, decoder)
         return ScanFile(kind=FileKind.MCAP, sensor="Ouster packets of a flight", scans=scans, dropped=decoder.dropped)
-    scan = open_mcap(path)
-    return ScanFile(
-        kind=FileKind.MCAP, sensor=topic or "LaserScan or PointCloud2", scans=_ros_mcap(scan, path, topic), dropped={}
-    )
+    dropped: dict[str, int] = {}
+    scans = _ros_mcap(open_mcap(path), path, topic, dropped)
+    return ScanFile(kind=FileKind.MCAP, sensor=topic or "LaserScan or PointCloud2", scans=scans, dropped=dropped)
 
 
 def _own_scans(path: Path, decoder: OusterDecoder) -> Iterator[FileScan]:
-    for item in open_mcap(path):
+    recording = open_mcap(path)
+    for item in recording:
         if isinstance(item, Message) and item.channel.topic == channels.INPUT_PREFIX + "lidar":
             raw = channels.unpack_raw(item.data)
             for scan in decoder.receive(raw.data, item.t_ns, raw.source):
                 yield scan_from_lidar(scan, decoder)
+    _tell_damage(recording, decoder.dropped)
 
 
-def _ros_mcap(scan: McapScan, path: Path, topic: str | None) -> Iterator[FileScan]:
+def _tell_damage(recording: McapScan, dropped: dict[str, int]) -> None:
+    """Of a recording that was read through."""
+    for damage in recording.damage:
+        dropped[f"bytes at {damage.offset}: {damage.what}"] = damage.bytes_lost
+    if not recording.is_finished and not recording.damage:
+        dropped["the end: it was not closed"] = 1
+
+
+def _ros_mcap(scan: McapScan, path: Path, topic: str | None, dropped: dict[str, int]) -> Iterator[FileScan]:
     rosbags_typesys = _import("rosbags.typesys")
     store = rosbags_typesys.get_typestore(rosbags_typesys.Stores.EMPTY)
     known: set[str] = set()
@@ -215,8 +241,9 @@ def _ros_mcap(scan: McapScan, path: Path, topic: str | None) -> Iterator[FileSca
         yield scan_from_ros(kind, read(item.data, kind))
     if chosen is None or not known:
         raise FileFormatError(
-            f"{path}: no LaserScan or PointCloud2 {'on ' + topic if topic else ''} in it; see stockpilot info"
+            f"{path}: no LaserScan or PointCloud2{' on ' + topic if topic else ''} in it; see stockpilot info"
         )
+    _tell_damage(scan, dropped)
 
 
 def _ros_name(name: str) -> str:
@@ -314,7 +341,7 @@ def _text_lines(path: Path, dropped: dict[str, int]) -> Iterator[str]:
         try:
             yield from file
         except (EOFError, zlib.error, gzip.BadGzipFile):
-            dropped["what follows: the file is cut or broken"] = 1
+            dropped[CUT] = 1
 
 
 def carmen_lines(path: Path, dropped: dict[str, int]) -> Iterator[tuple[str, int, int]]:

@@ -17,6 +17,7 @@ from companion.config import VolumeConfig
 from companion.errors import FileFormatError
 from companion.mapping.export import load_point_map
 from companion.messages import PointMap, VolumeReport
+from companion.recording.manifest import require_unaltered_file
 from companion.volume import estimate_volume
 
 MIN_CELL_M, MAX_CELL_M = 0.05, 5.0
@@ -128,6 +129,7 @@ def _load(cloud: Path) -> PointMap:
             raise FileFormatError(f"{cloud}: a folder; expected a point cloud file, or a run's folder with map.ply")
         cloud = inside
     try:
+        require_unaltered_file(cloud)
         return load_point_map(cloud)
     except FileNotFoundError:
         raise FileFormatError(f"{cloud}: there is no such file") from None

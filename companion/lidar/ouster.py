@@ -29,10 +29,14 @@ SILENCE_NS = 500_000_000  # after this without a packet, another start of the sa
 PACKET_TYPE_LIDAR = 1
 FRAMES_BACK = 8  # a frame this little older than the current one is late, not a counter that started anew
 
-_STANDARD_HEADER = struct.Struct("<HHQ")  # type, frame id, then 24 bits init id and 40 bits serial number
 _COLUMN_START = struct.Struct("<QH")  # stamp, measurement id
 _CHECKSUM = struct.Struct("<Q")
 CHECKSUM_SIZE = _CHECKSUM.size
+
+
+def _standard_start(header_size: int) -> struct.Struct:
+    """Type, frame id, 24 bits init id and 40 bits serial number; after the header, stamp and measurement id."""
+    return struct.Struct(f"<HHQ{header_size - 12}xQH")
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +129,6 @@ class OusterDecoder:
         self.clock = SensorClock()
         self._format = core.PacketFormat.from_info(info)
         self._pixel = _PIXELS[profile]
-        self._is_standard = info.format.header_type == core.HeaderType.STANDARD and profile != "LEGACY"
         self._has_identity = profile != "LEGACY"
         self._columns_per_packet = int(info.format.columns_per_packet)
         self._expected_packets = int(info.format.lidar_packets_per_frame())
@@ -133,6 +136,8 @@ class OusterDecoder:
         empty = np.zeros(self._packet_size, np.uint8)
         self._has_checksum = self._has_identity and self._format.crc(empty) is not None
         self._header_size = int(self._format.packet_header_size)
+        is_standard = info.format.header_type == core.HeaderType.STANDARD and profile != "LEGACY"
+        self._standard_start = _standard_start(self._header_size) if is_standard else None
         self._width = int(info.w)
         self._max_frame_id = int(self._format.max_frame_id)
         self._period_ns = round(1e9 / (int(info.format.fps) * info.w))
@@ -140,6 +145,7 @@ class OusterDecoder:
         self._init_id: int | None = None
         self._host: str | None = None
         self._t_last_ns: int | None = None
+        self._sender: tuple[tuple[int, int], str | None] | None = None  # of the last packet that was ours
         self._dtype = _packet_dtype(self._format, self._pixel, info.h, profile)
         slots = -(-info.w // self._columns_per_packet)
         self._packets: list[bytes] = [bytes(self._packet_size)] * slots
@@ -165,14 +171,16 @@ class OusterDecoder:
         self.packets += 1
         if len(packet) != self._packet_size:
             return self._drop("size")
-        kind, frame_id, init_id, serial = self._read_header(packet)
-        stamp, measurement = _COLUMN_START.unpack_from(packet, self._header_size)
+        kind, frame_id, identity, stamp, measurement = self._read_start(packet)
         if kind != PACKET_TYPE_LIDAR or measurement >= self._width:
             return self._drop("header")
         if self._has_checksum and not self._is_sound(packet):
             return self._drop("checksum")
-        if not self._is_ours(init_id, serial, source, t_ns):
-            return self._drop("foreign")
+        sender = identity, None if source is None else source[0]
+        if sender != self._sender:
+            if not self._is_ours(*identity, sender[1], t_ns):
+                return self._drop("foreign")
+            self._sender = sender
         self._t_last_ns = t_ns
         self.clock.update(stamp + (self._columns_per_packet - 1) * self._period_ns, t_ns)
         return self._place(packet, frame_id, measurement // self._columns_per_packet)
@@ -181,13 +189,15 @@ class OusterDecoder:
         self.dropped[reason] += 1
         return []
 
-    def _read_header(self, packet: bytes) -> tuple[int, int, int, int]:
-        """(packet type, frame id, init id, serial number)."""
-        if self._is_standard:
-            kind, frame_id, identity = _STANDARD_HEADER.unpack_from(packet)
-            return kind, frame_id, identity & 0xFFFFFF, identity >> 24
+    def _read_start(self, packet: bytes) -> tuple[int, int, tuple[int, int], int, int]:
+        """Packet type, frame id, (init id, serial number); stamp and measurement id of the first column."""
+        if self._standard_start is not None:
+            kind, frame_id, identity, stamp, measurement = self._standard_start.unpack_from(packet)
+            return kind, frame_id, (identity & 0xFFFFFF, identity >> 24), stamp, measurement
         fmt, array = self._format, np.frombuffer(packet, dtype=np.uint8)
-        return PACKET_TYPE_LIDAR, int(fmt.frame_id(array)), int(fmt.init_id(array)), int(fmt.prod_sn(array))
+        stamp, measurement = _COLUMN_START.unpack_from(packet, self._header_size)
+        identity = int(fmt.init_id(array)), int(fmt.prod_sn(array))
+        return PACKET_TYPE_LIDAR, int(fmt.frame_id(array)), identity, stamp, measurement
 
     def _is_sound(self, packet: bytes) -> bool:
         """Whether the checksum in the last eight bytes is that of all before it."""
@@ -195,10 +205,10 @@ class OusterDecoder:
         (stored,) = _CHECKSUM.unpack_from(packet, end)
         return stored in NO_CHECKSUM or stored == crc64.xz(packet[:end])
 
-    def _is_ours(self, init_id: int, serial: int, source: tuple[str, int] | None, t_ns: int) -> bool:
+    def _is_ours(self, init_id: int, serial: int, host: str | None, t_ns: int) -> bool:
+        """Whether a packet of another sender than the last one's is believed."""
         if self._serial and serial != self._serial and self._has_identity:
             return False
-        host = None if source is None else source[0]
         is_known = init_id == self._init_id and (host is None or self._host is None or host == self._host)
         if not is_known:
             if self._t_last_ns is not None and t_ns - self._t_last_ns < SILENCE_NS:

@@ -44,8 +44,15 @@ class SensorClock:
             if len(self._strange) >= STEP_PACKETS:
                 self._judge_step(arrival_ns)
             return
-        self._strange.clear()
-        self._accept(delay, arrival_ns)
+        if self._strange:
+            self._strange.clear()
+        if arrival_ns - self._window_start_ns >= WINDOW_NS:
+            self._previous_ns, self._current_ns = self._current_ns, delay
+            self._window_start_ns = arrival_ns
+        if delay < self._current_ns:
+            self._current_ns = delay
+        previous, current = self._previous_ns, self._current_ns
+        self._offset_ns = current if previous is None or current < previous else previous
 
     def _judge_step(self, arrival_ns: int) -> None:
         """Believe the step if the strange packets agree; a backlog that drains (each less late) is no step."""
@@ -60,14 +67,6 @@ class SensorClock:
         self._previous_ns = None
         self._window_start_ns = arrival_ns
         self._strange.clear()
-
-    def _accept(self, delay_ns: int, arrival_ns: int) -> None:
-        if arrival_ns - self._window_start_ns >= WINDOW_NS:
-            self._previous_ns, self._current_ns = self._current_ns, delay_ns
-            self._window_start_ns = arrival_ns
-        self._current_ns = min(self._current_ns, delay_ns)
-        previous = self._previous_ns
-        self._offset_ns = self._current_ns if previous is None else min(previous, self._current_ns)
 
 
 def _drains(delays_ns: list[int]) -> bool:

@@ -19,15 +19,21 @@ VLR_RECORD = 1
 LAS_SCALE_M = 0.0001
 
 
+def map_writer(path: Path) -> Callable[[PointMap, Path], None]:
+    """What writes a map of that name. Raises: FileFormatError: its ending is none of .ply, .las, .laz."""
+    writers: dict[str, Callable[[PointMap, Path], None]] = {".ply": _save_ply, ".las": _save_las, ".laz": _save_las}
+    writer = writers.get(path.suffix.lower())
+    if writer is None:
+        raise FileFormatError(f"{path}: a map is written as .ply, .las or .laz, not as '{path.suffix}'")
+    return writer
+
+
 def save_point_map(point_map: PointMap, path: Path) -> None:
     """Write the map as .ply, .las or .laz (by the name's end); path and pose sigma go with it.
 
     Raises: FileFormatError: another ending. OSError: the disk.
     """
-    writers: dict[str, Callable[[PointMap, Path], None]] = {".ply": _save_ply, ".las": _save_las, ".laz": _save_las}
-    writer = writers.get(path.suffix.lower())
-    if writer is None:
-        raise FileFormatError(f"{path}: a map is written as .ply, .las or .laz, not as '{path.suffix}'")
+    writer = map_writer(path)
     part = path.with_name(f".{path.name}.part{path.suffix}")
     try:
         writer(point_map, part)

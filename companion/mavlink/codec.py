@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import binascii
 from collections import Counter
 from dataclasses import dataclass
+
+from fastcrc import crc16
 
 from companion.mavlink import wire
 
@@ -12,13 +13,11 @@ _MAGIC_1 = 0xFE
 _MAGIC_2 = 0xFD
 _FLAG_SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
-_REVERSED = bytes(int(f"{i:08b}"[::-1], 2) for i in range(256))
 
 
 def crc(data: bytes) -> int:
-    """CRC-16/MCRF4XX, MAVLink's checksum. The C library has only its mirror image, hence the turned bits."""
-    mirrored = binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF)
-    return _REVERSED[mirrored & 0xFF] << 8 | _REVERSED[mirrored >> 8]
+    """CRC-16/MCRF4XX, MAVLink's checksum."""
+    return crc16.mcrf4xx(data)
 
 
 @dataclass(frozen=True, slots=True)

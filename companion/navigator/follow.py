@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import math
 import statistics
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
+from operator import attrgetter
 
 from companion.geometry import wrap_angle, yaw_from_quat
 from companion.messages import OdometryEstimate, Setpoint
@@ -38,6 +40,9 @@ class _Trace:
     done: tuple[float, float, float]
 
 
+_t_ns = attrgetter("t_ns")
+
+
 class FollowWatch:
     """Horizontal motion and turning, asked and done, over the last three seconds; over more of them in gusts."""
 
@@ -45,6 +50,7 @@ class FollowWatch:
         self._traces: deque[_Trace] = deque()
         # What done was off asked over WINDOW_NS, time after time.
         self._off_m: deque[float] = deque(USUAL_AT_FIRST, maxlen=USUAL_COUNT)
+        self._usual_m = statistics.median(self._off_m)
         self._off_ns = 0
         self._since_ns: int | None = None
         self._reset_counter = 0
@@ -92,20 +98,21 @@ class FollowWatch:
         if t_ns - self._off_ns >= USUAL_EVERY_NS and t_ns - self._traces[0].t_ns >= WINDOW_NS:
             (ax, ay, _), (dx, dy, _) = self._within(WINDOW_NS)
             self._off_m.append(math.hypot(dx - ax, dy - ay))
+            self._usual_m = statistics.median(self._off_m)
             self._off_ns = t_ns
 
     def _within(self, window_ns: int) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         """Asked and done within the last so many ns, or since it began to be watched."""
         end = self._traces[-1]
-        begin = next(trace for trace in self._traces if end.t_ns - trace.t_ns <= window_ns)
-        ax, ay, asked_turn = (after - before for before, after in zip(begin.asked, end.asked, strict=True))
-        dx, dy, turned = (after - before for before, after in zip(begin.done, end.done, strict=True))
-        return (ax, ay, asked_turn), (dx, dy, turned)
+        begin = self._traces[bisect_left(self._traces, end.t_ns - window_ns, key=_t_ns)]
+        (a, b, c), (ax, ay, asked_turn) = begin.asked, end.asked
+        (d, e, f), (dx, dy, turned) = begin.done, end.done
+        return (ax - a, ay - b, asked_turn - c), (dx - d, dy - e, turned - f)
 
     def _unfollowed(self) -> str:
         if len(self._traces) < 2:
             return ""
-        usual_m = statistics.median(self._off_m)
+        usual_m = self._usual_m
         for window_ns in WINDOWS_NS:
             (ax, ay, _), (dx, dy, _) = self._within(window_ns)
             asked_m = math.hypot(ax, ay)

@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 
 from companion.config import LidarConfig
 from companion.geometry import matrix_from_quat, quat_from_rpy
-from companion.messages import Array, LevelledScan, LidarScan
+from companion.messages import Array, LevelledScan, LidarGeometry, LidarScan
 from companion.odometry import level_kernels as lk
 from companion.odometry.attitude import AttitudeHistory
 
+LOW_M = 1.5  # of height: until it has risen, nothing tells walls from the foot of a pile
+LOW_SPACING_M = 0.2
+NO_PILE_ABOVE_M = 6.0
+BELOW_RAD = math.radians(
+    11.0
+)  # the layer that is asked whether a surface leans: reaches the floor at five times the height
 NOISE_RATE = 0.05  # of a scan in what is known of the noise of returns
 MIN_BENDS = 50  # of which the noise of returns is told
 BLOCK_RAD = math.radians(2.9)  # neighbours of a layer that are averaged: 4 of 512 columns
@@ -73,9 +79,40 @@ class Leveller:
         return levelled, every
 
 
-def wall_layer(levelled: LevelledScan, row: int, above_m: float) -> Array:
-    """(N, 2) x and y of that row's returns, without those that lie no higher than above_m: floor, not wall."""
-    return lk.layer_above(levelled.points_level, levelled.row, row, above_m)
+def wall_layer(
+    levelled: LevelledScan, geometry: LidarGeometry, above_m: float, z_m: float, noise_m: float, *, is_climbing: bool
+) -> Array:
+    """(N, 2) x and y of the horizontal layer's returns that may be walls, in the levelled frame.
+
+    Not those that lie no higher than above_m: floor. Below NO_PILE_ABOVE_M (z_m: height above where it stood) not those of a
+    surface that leans back, by what the layers below see of it: a pile, whose line moves away as the vehicle climbs. Two are
+    asked, and have to agree: a wall behind a pile is not one slope with it. Below LOW_M the second sees but the floor.
+
+    Off the ground (is_climbing) and below LOW_M, where the first cannot tell yet either, one return counts for each
+    LOW_SPACING_M of width: the foot of a pile close by fills half of the turn, and outvotes the walls.
+    """
+    spacing_m = LOW_SPACING_M if is_climbing and z_m < LOW_M else 0.0
+    row = geometry.horizontal_row
+    below, lowest = (_row_below(geometry.elevation_rad, row, n * BELOW_RAD) for n in (1, 2))
+    rows = (row, below, lowest) if z_m < NO_PILE_ABOVE_M else (row, -1, -1)
+    return lk.upright_layer(
+        levelled.points_level,
+        levelled.row,
+        levelled.column,
+        rows,
+        geometry.directions.shape[1],
+        above_m,
+        noise_m,
+        spacing_m,
+        z_m > LOW_M,
+    )
+
+
+def _row_below(elevation_rad: Array, row: int, angle_rad: float) -> int:
+    """The layer whose elevation is nearest to so much under that row's; -1 where none is near it."""
+    under = elevation_rad[row] - elevation_rad
+    found = int(np.argmin(np.abs(under - angle_rad)))
+    return found if abs(under[found] - angle_rad) < 0.5 * BELOW_RAD else -1
 
 
 def range_noise_m(range_m: NDArray[np.float32]) -> float:

@@ -14,6 +14,13 @@ from companion.jit import kernel
 from companion.messages import Array
 from companion.odometry.attitude import interpolate_at
 
+LEAN_COLUMNS = 4  # to each side, whose median tells whether a surface leans
+LEAST_LEANING = 3
+LEAN_SIGMAS = 3.0
+STEEPEST = 0.7  # metres back for each up: 55 deg, steeper than stored bulk lies
+STRAIGHT = 0.35  # share by which the two differ on one slope
+LEAST_DROP_M = 0.1
+SAME_M = 1.0  # of range between columns of one surface
 SECTORS = 8  # of a turn: what is too near is told by a layer's median over one, not by the noise of a block
 BLOCK_SPAN_M = 0.6  # of range, about the block's median, beyond which a return is not the same surface
 
@@ -121,16 +128,78 @@ def within_range(
 
 
 @kernel
-def layer_above(points: Array, row: NDArray[np.int64], layer_row: int, above_m: float) -> Array:
-    """(M, 2) x and y of the points of one row that lie higher than above_m in the level frame."""
-    out = np.empty((len(row), 2))
-    n = 0
+def upright_layer(
+    points: Array,
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    rows: tuple[int, int, int],
+    columns: int,
+    above_m: float,
+    noise_m: float,
+    spacing_m: float,
+    needs_both: bool,
+) -> Array:
+    """(M, 2) x and y of the points of the first of the rows that may be walls: see level.wall_layer. The others: the layers
+    below that are asked, -1: none. needs_both: else the first of these is enough."""
+    width = 2.0 * math.pi / columns
+    flat, height = np.full((3, columns), np.nan), np.full((3, columns), np.nan)
     for i in range(len(row)):
-        if row[i] == layer_row and points[i, 2] > above_m:
-            out[n, 0] = points[i, 0]
-            out[n, 1] = points[i, 1]
-            n += 1
+        for k in range(3):
+            if row[i] == rows[k] and points[i, 2] > above_m:
+                flat[k, column[i]] = math.hypot(points[i, 0], points[i, 1])
+                height[k, column[i]] = points[i, 2]
+    out = np.empty((len(row), 2))
+    near, low = np.empty(2 * LEAN_COLUMNS + 1), np.empty(2 * LEAN_COLUMNS + 1)
+    n, passed, last = 0, np.inf, -1
+    for i in range(len(row)):
+        if row[i] != rows[0] or points[i, 2] <= above_m:
+            continue
+        if rows[1] >= 0 and _leans(flat, height, column[i], noise_m, needs_both, near, low):
+            continue
+        if spacing_m > 0.0:
+            step = float(column[i] - last)
+            passed += step * width * math.hypot(points[i, 0], points[i, 1])
+            last = column[i]
+            if passed < spacing_m:
+                continue
+            passed = 0.0
+        out[n, 0] = points[i, 0]
+        out[n, 1] = points[i, 1]
+        n += 1
     return out[:n].copy()
+
+
+@kernel
+def _leans(flat: Array, height: Array, column: int, noise_m: float, needs_both: bool, near: Array, low: Array) -> bool:
+    """Whether a surface leans back by more than noise lets it look. flat, height: (3, columns) of the layer and of the two
+    that are asked, distance from the axis and height; near, low: scratch."""
+    back, noise = _lean(flat, height, 0, column, noise_m, near, low)
+    if not back > STEEPEST + noise:
+        return False
+    if not needs_both:
+        return True
+    on, more = _lean(flat, height, 1, column, noise_m, near, low)
+    return abs(on - back) < STRAIGHT * back + noise + more
+
+
+@kernel
+def _lean(
+    flat: Array, height: Array, k: int, column: int, noise_m: float, near: Array, low: Array
+) -> tuple[float, float]:
+    """By how many metres a surface goes back for each that it rises, between rows k and k + 1, and what noise makes of that;
+    NaN where they do not tell."""
+    n, columns = 0, flat.shape[1]
+    for at in range(-LEAN_COLUMNS, LEAN_COLUMNS + 1):
+        c = (column + at) % columns
+        if abs(flat[0, c] - flat[0, column]) < SAME_M and not math.isnan(flat[k, c] - flat[k + 1, c]):
+            near[n], low[n] = flat[k, c] - flat[k + 1, c], height[k, c] - height[k + 1, c]
+            n += 1
+    if n < LEAST_LEANING:
+        return np.nan, np.nan
+    drop = middle_of(low, n)
+    if drop < LEAST_DROP_M:
+        return np.nan, np.nan
+    return middle_of(near, n) / drop, LEAN_SIGMAS * 1.25 * math.sqrt(2.0 / n) * noise_m / drop
 
 
 @kernel

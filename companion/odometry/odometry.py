@@ -32,10 +32,10 @@ from companion.odometry.degeneracy import Judgement, judge, weak_direction
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
 from companion.odometry.keyframes import PlacedScan, WaitingScans
-from companion.odometry.level import AllReturns, Leveller, ReturnNoise, block_means, wall_layer
+from companion.odometry.level import LOW_M, AllReturns, Leveller, ReturnNoise, block_means, wall_layer
 from companion.odometry.ranges import SCANS, layer_ranges, wall_ranges
 from companion.odometry.relocalise import relocalise
-from companion.odometry.specks import without_specks
+from companion.odometry.specks import specks, without_dust
 from companion.odometry.standstill import Standstill
 from companion.odometry.wall_map import Registration, WallMap
 
@@ -43,13 +43,14 @@ PRIOR_COVARIANCE = np.diag(np.array([0.06, 0.06, 0.02]) ** 2)  # m, m, rad: hold
 FLOOR_VARIANCE = np.array([0.004, 0.004, 0.0004]) ** 2  # what a registration errs by at best: roughness, time stamps
 KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
 KEYFRAME_HEIGHT_LOW_M = 0.2  # below LOW_M, where nothing yet tells walls from the foot of a pile
-LOW_M = 1.5
 FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
 WAIT_FOR_FIRST_SCANS = 5
 MIN_VALID_COLUMNS_FIRST_RATIO = 0.75  # the first scan makes the map: one that was joined in mid-turn would ruin it
 SUDDEN_LOSS = 0.15  # share of the layer's points that lose their wall at once
 MIN_JUMP_M = 0.2
+DUST_SIGMA_M = 0.05  # of x and y, were all returns dust: what is left of it before the walls shrinks the map
+DUST_RATE = 0.01
 MOST_LOW_SCANS = 100  # a take-off is over by then: what stays low was not taking off
 
 
@@ -91,6 +92,7 @@ class Odometry:
         self._layers: deque[Array] = deque(maxlen=SCANS)  # of the last scans, newest first
         self._sigma_range_m = 0.1
         self._return_noise = ReturnNoise()  # of single returns: the registration's also holds what walls are rough by
+        self._dust_ratio = 0.0  # of the returns, lately
         self._accepted = 0
         self._usual_share = 0.0  # of the layer's points that found a wall, lately
         self._is_weak, self._is_lost = False, False  # along an axis: not held by walls; nor known well enough to map
@@ -165,11 +167,25 @@ class Odometry:
         vertical = kalman.start_vertical(scan.t_ns) if old is None else kalman.carry_vertical(old.vertical, scan.t_ns)
         velocity = kalman.velocity_level(planar, vertical)
         levelled, every = self._leveller.level(scan, history, velocity, self.height.tilt_offset_rad)
-        levelled = without_specks(scan, levelled)
         row = scan.geometry.horizontal_row
-        layer = wall_layer(levelled, row, self.height.floor_below_m(float(vertical.x[0])))
+        lone = specks(scan)
+        self._return_noise.see(
+            scan.range_m[row] if lone is None else np.where(lone[row], np.float32(0.0), scan.range_m[row])
+        )
+        share = 0.0 if lone is None else float(np.mean(lone))
+        self._dust_ratio += DUST_RATE * (share - self._dust_ratio)
+        if lone is not None:
+            levelled = without_dust(scan, levelled, lone, self._return_noise.sigma_m)
+        z_m = float(vertical.x[0])
+        layer = wall_layer(
+            levelled,
+            scan.geometry,
+            self.height.floor_below_m(z_m),
+            z_m,
+            self._return_noise.sigma_m,
+            is_climbing=self._is_released,
+        )
         near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
-        self._return_noise.see(scan.range_m[row])
         lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None
         if old is None:
@@ -196,7 +212,7 @@ class Odometry:
         return ScanResult(
             estimate=estimate_at(snapshot, history, scan.t_ns, is_scan=True),
             levelled=levelled,
-            wall_ranges=self._look_around(scan, every),
+            wall_ranges=self._look_around(scan, every, is_dusty=lone is not None),
             keyframe=snapshot.is_keyframe,
             registration=registration,
             judgement=judgement,
@@ -207,10 +223,10 @@ class Odometry:
 
     # -- steps
 
-    def _look_around(self, scan: LidarScan, every: AllReturns) -> WallRanges:
+    def _look_around(self, scan: LidarScan, every: AllReturns, *, is_dusty: bool) -> WallRanges:
         r_body_lidar, least_m = self._leveller.r_body_lidar, self._cfg.lidar.min_range_m
         self._layers.appendleft(layer_ranges(scan))
-        return wall_ranges(scan, every, r_body_lidar, least_m, self._layers)
+        return wall_ranges(scan, every, r_body_lidar, least_m, self._layers, is_dusty=is_dusty)
 
     def _is_unusable(self, scan: LidarScan, history: AttitudeHistory | None) -> bool:
         reason = ""
@@ -394,7 +410,10 @@ class Odometry:
         step_m = KEYFRAME_HEIGHT_M if z_m > LOW_M else KEYFRAME_HEIGHT_LOW_M
         climbed = abs(z_m - self._keyframe_z_m) > step_m
         is_keyframe = accepted and not self._is_lost and (due or climbed)
-        planar_map = registration.map_variance + self._base_variance if accepted else old.map_variance[:3]
+        planar_map = old.map_variance[:3]
+        if accepted:
+            dust = (DUST_SIGMA_M * self._dust_ratio) ** 2
+            planar_map = registration.map_variance + self._base_variance + np.array([dust, dust, 0.0])
         quality = max(1, min(100, round(100 * registration.matched_ratio))) if accepted else old.quality
         if judgement.is_degenerate:
             quality = weak.quality_at(weak.sigma_along(planar, judgement.weak_axis), quality)

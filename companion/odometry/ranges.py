@@ -25,7 +25,8 @@ HAZE_RATIO = 0.035  # of the layer's columns are specks: in thicker dust specks 
 THICK_BESIDE_COLUMNS = 4  # a thing needs more
 THICK_COMPANIONS = 3  # neighbours, or has to be there
 THICK_BEFORE_COLUMNS = 1  # so near to itself, and a scan longer
-MOST_SPECKS_RATIO = 0.068  # of the layer's columns: in still thicker dust every return counts, and stops the vehicle
+LEANING = 0.02  # more for each metre of range and column between two returns of one thing: a surface seen at 60 deg
+MOST_SPECKS_RATIO = 0.12  # of the layer's columns: in still thicker dust every return counts, and stops the vehicle
 
 
 def layer_ranges(scan: LidarScan) -> Array:
@@ -40,18 +41,21 @@ def wall_ranges(
     r_body_lidar: Array,
     min_range_m: float,
     layers: Sequence[Array] = (),
+    *,
+    is_dusty: bool = False,
 ) -> WallRanges:
     """Distances from the body's centre in the horizontal layer.
 
     layers: `layer_ranges` of this scan and the three before it, newest first; fewer: every return counts. A near return
     counts where it has neighbours, or where it came in the two scans before too (three in thick dust); one that stands
-    alone is a speck of dust, and nobody knows what lies behind it.
+    alone is a speck of dust, and nobody knows what lies behind it. is_dusty: so are those farther off, by the rules of
+    thick dust: else a lap is spent braking before walls and columns that are none.
 
     The paper counts beams from behind, clockwise: index r/2 looks ahead and r/4... to the right with its sensor's
     order reversed; here both are found by bearing, so that the order of the beams does not matter (docs/paper.md).
     """
     is_comparable = len(layers) == SCANS and len({layer.shape for layer in layers}) == 1
-    is_speck = _specks(np.stack(layers)) if is_comparable else np.zeros(len(scan.column_valid), np.bool_)
+    is_speck = _specks(np.stack(layers), is_dusty) if is_comparable else np.zeros(len(scan.column_valid), np.bool_)
     front, right, ranges, is_seen = _look_around(
         every.points_level,
         every.range_m,
@@ -123,27 +127,39 @@ def _look_around(
 
 
 @kernel
-def _specks(layers: Array) -> NDArray[np.bool_]:
-    """(columns,) near returns that stand alone. layers: (4, columns) ranges of this scan and those before it."""
+def _specks(layers: Array, is_dusty: bool) -> NDArray[np.bool_]:
+    """(columns,) returns that stand alone, near ones, in dust all. layers: (4, columns) of this scan and those before."""
     columns = layers.shape[1]
-    is_speck = _alone(layers, BESIDE_COLUMNS, COMPANIONS, BEFORE_COLUMNS, 2)
+    is_speck = _alone(layers, 0.0, NEAR_M, 0.0, BESIDE_COLUMNS, COMPANIONS, BEFORE_COLUMNS, 2)
+    thick = (THICK_BESIDE_COLUMNS, THICK_COMPANIONS, THICK_BEFORE_COLUMNS, 3)
     if np.sum(is_speck) > HAZE_RATIO * columns:
-        is_speck = _alone(layers, THICK_BESIDE_COLUMNS, THICK_COMPANIONS, THICK_BEFORE_COLUMNS, 3)
+        is_speck = _alone(layers, 0.0, NEAR_M, 0.0, *thick)
     if np.sum(is_speck) > MOST_SPECKS_RATIO * columns:
         is_speck[:] = False
+    if is_dusty:
+        is_speck |= _alone(layers, NEAR_M, np.inf, LEANING, *thick)
     return is_speck
 
 
 @kernel
-def _alone(layers: Array, beside_columns: int, companions: int, before_columns: int, scans: int) -> NDArray[np.bool_]:
-    """(columns,) near returns with fewer companions in their scan, and not there in each of so many scans before."""
+def _alone(
+    layers: Array,
+    from_m: float,
+    to_m: float,
+    leaning: float,
+    beside_columns: int,
+    companions: int,
+    before_columns: int,
+    scans: int,
+) -> NDArray[np.bool_]:
+    """(columns,) returns in that range with fewer companions in their scan, and not there in each of so many before."""
     columns = layers.shape[1]
     is_alone = np.zeros(columns, np.bool_)
     for c in range(columns):
         reach = layers[0, c]
-        if reach >= NEAR_M:
+        if not from_m <= reach < to_m:
             continue
-        if beside(layers[0], c, beside_columns, 0.0)[0] < companions:
+        if not has_beside(layers[0], c, beside_columns, leaning, companions):
             was_there = True
             for n in range(1, scans + 1):
                 was_there = was_there and _was_there(layers[n], c, reach, n * before_columns)
@@ -159,10 +175,35 @@ def beside(row: Array | NDArray[np.float32], column: int, columns: int, leaning:
     together, farther = 0, 0
     for k in range(1, columns + 1):
         reach = TOGETHER_M + leaning * k * own
-        left, right = float(row[(column - k) % len(row)]), float(row[(column + k) % len(row)])
+        left, right = _neighbours(row, column, k)
         together += int(left > 0.0 and abs(left - own) <= reach) + int(right > 0.0 and abs(right - own) <= reach)
         farther += int(left > own + reach) + int(right > own + reach)
     return together, farther
+
+
+@kernel
+def has_beside(row: Array | NDArray[np.float32], column: int, columns: int, leaning: float, companions: int) -> bool:
+    """Whether so many returns lie together with this one, as `beside` counts them: most are seen in the first columns."""
+    own = float(row[column])
+    together = 0
+    for k in range(1, columns + 1):
+        reach = TOGETHER_M + leaning * k * own
+        left, right = _neighbours(row, column, k)
+        together += int(left > 0.0 and abs(left - own) <= reach) + int(right > 0.0 and abs(right - own) <= reach)
+        if together >= companions:
+            return True
+    return False
+
+
+@kernel
+def _neighbours(row: Array | NDArray[np.float32], column: int, k: int) -> tuple[float, float]:
+    """Of a closed row, k columns to the left and right; a remainder is taken only at its seam: it is slow."""
+    left, right = column - k, column + k
+    if left < 0:
+        left = left % len(row)
+    if right >= len(row):
+        right = right % len(row)
+    return float(row[left]), float(row[right])
 
 
 @kernel

@@ -90,3 +90,18 @@ def require_unaltered(folder: Path, names: Iterable[str] | None = None) -> None:
     if found:
         lines = [f"{folder / m.name}: {m.what}" for m in found]
         raise FileFormatError("\n".join([f"{folder / MANIFEST_NAME}: the run was altered; it is not read", *lines]))
+
+
+def require_unaltered_file(path: Path) -> None:
+    """The same for any file that a command is given: a manifest beside it that is none of ours says nothing of it.
+
+    Raises: FileFormatError: it lies in a run's folder and is not what it was when the run ended.
+    """
+    try:
+        found = compare(path.parent, [path.name])
+    except FileFormatError:
+        return
+    if found:
+        raise FileFormatError(
+            f"{path}: {found[0].what} ({MANIFEST_NAME} of the run): it is not read; copied out of the run's folder it is"
+        )

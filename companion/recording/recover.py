@@ -12,6 +12,7 @@ from companion.recording.mcap_read import Attachment, Damage, McapScan, Message,
 from companion.recording.mcap_write import Channel, McapWriter, Schema
 
 SUFFIX = ".recovered.mcap"
+RECOVERED = "recovered"  # metadata of a rebuilt recording: what was lost, by where
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +74,7 @@ def _rebuild(path: Path, target: Path) -> None:
             copier = _Copier(scan, writer)
             for item in scan:
                 copier.copy(item)
+            writer.add_metadata(RECOVERED, _what_was_lost(scan))
             writer.finish()
             file.flush()
             os.fsync(file.fileno())
@@ -81,6 +83,14 @@ def _rebuild(path: Path, target: Path) -> None:
         raise FileFormatError(f"{target}: cannot be written: {error.strerror}") from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _what_was_lost(scan: McapScan) -> dict[str, str]:
+    """Of a recording that was read through: a rebuilt one is closed and sound in itself, but it has holes."""
+    lost = {f"at byte {d.offset}": f"{d.bytes_lost} bytes: {d.what}" for d in scan.damage}
+    if scan.orphans:
+        lost["messages of unknown channels"] = str(scan.orphans)
+    return lost or {"end": "it was not closed"}
 
 
 class _Copier:

@@ -63,26 +63,28 @@ class Replay:
 
     def feed(self, item: Input) -> None:
         """One recorded call."""
-        flight, t_ns = self.flight, item.t_ns
-        self.first_ns = t_ns if self.first_ns is None else self.first_ns
+        kind, t_ns, data, source = item
+        if self.first_ns is None:
+            self.first_ns = t_ns
         self.last_ns = t_ns
-        self._is_feeding = item.kind
-        if item.kind == "lidar":
+        if kind == "lidar":
             self.scans.lidar(item)
             return
-        if item.kind == "mavlink":
-            flight.on_mavlink(item.data, t_ns, item.source)
-        elif item.kind == "poll":
+        flight, self._is_feeding = self.flight, kind
+        if kind == "mavlink":
+            flight.on_mavlink(data, t_ns, source)
+        elif kind == "poll":
             flight.poll(t_ns)
-        elif item.kind == "begin":
+        elif kind == "begin":
             self.scans.begin(t_ns)
-        elif item.kind == "accept":
+        elif kind == "accept":
             self._accept(t_ns)
-        elif item.kind == "operator":
+        elif kind == "operator":
             self._operator(item)
-        elif item.kind == "told":
-            flight.on_told(item.data, t_ns)
-        self.frames += [(t_ns, frame) for frame in flight.take_output()]
+        elif kind == "told":
+            flight.on_told(data, t_ns)
+        for frame in flight.take_output():
+            self.frames.append((t_ns, frame))
 
     def _accept(self, t_ns: int) -> None:
         accepted = self.scans.accept()

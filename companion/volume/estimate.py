@@ -27,13 +27,17 @@ LEAST_FROM_ABOVE = 0.3  # of the map's points
 BESIDE_WALLS_M = 1.0  # beyond the strip
 
 
-def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float | None = None) -> VolumeReport:
+def estimate_volume(
+    point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float | None = None, is_cut_short: bool = False
+) -> VolumeReport:
     """Volume of the material above the floor and within the walls, with its interval.
 
     Args:
         point_map: in `map`, z up. A path is used when there is one (where it is free, how high was flown).
         cfg: cell size and level of the interval.
         floor_z_m: height of a level floor, taken as exact; None: the floor is found in the map.
+        is_cut_short: the flight did not go all round: where no closed walls are found either, nobody knows how much lies
+            beyond the map, and the interval has no upper end.
 
     Returns: the report. A poor map is told by `warnings` and a wide interval, never by an exception; a map that shows
         no surface at all gives volume NaN and the interval (0, inf).
@@ -70,7 +74,13 @@ def estimate_volume(point_map: PointMap, cfg: VolumeConfig, *, floor_z_m: float 
         grid, cells, footprint.share > 0, strip, reach_m=INTERPOLATION_REACH_M, strip_width_m=footprint.margin_m
     )
     surface, contact = _meet_walls(points, grid, np.where(low, key, -1), footprint, floor, surface)
-    return _report(point_map, cfg, grid, footprint, cells, floor, surface, contact)
+    report = _report(point_map, cfg, grid, footprint, cells, floor, surface, contact)
+    return _at_least(report) if is_cut_short and not footprint.has_walls else report
+
+
+def _at_least(report: VolumeReport) -> VolumeReport:
+    said = "the flight was cut short and no closed walls were found: what lies beyond the map is not counted"
+    return replace(report, interval_m3=(report.interval_m3[0], float("inf")), warnings=(*report.warnings, said))
 
 
 def _meet_walls(

@@ -167,9 +167,11 @@ def roughness(e: Evidence) -> float:
 
 
 def _obstacles(e: Evidence) -> float:
-    """Half of what an obstacle's foot would hold at the pile's mean height, when one stands in the pile."""
+    """Half of what each obstacle's foot would hold at the pile's height there, where one stands in the pile."""
     inside = e.pile & (e.share < 1.0) & (e.depth_m > 2 * e.grid.cell_m)
-    if not inside.any():
+    label, n = ndimage.label(inside)
+    if n == 0:
         return 0.0
-    cut = (1.0 - e.share[inside]) * e.grid.cell_area_m2 * np.maximum(e.height_m[inside], 0.0)
-    return 0.5 * float(cut.sum())
+    cut = np.where(inside, (1.0 - e.share) * e.grid.cell_area_m2 * np.maximum(e.height_m, 0.0), 0.0)
+    each = np.bincount(label.ravel(), cut.ravel(), minlength=n + 1)[1:]
+    return 0.5 * math.sqrt(float(np.sum(each**2)))

@@ -15,6 +15,7 @@ from companion.recording.log import Recorder
 from companion.recording.manifest import write_manifest
 from companion.recording.replay import Replay
 from companion.recording.run_files import Input, read_run
+from companion.topics import VOLUME
 from stockpilot.cli import main as stockpilot_main
 from stockpilot.replay import describe, recorded_config, replay_command, replay_run
 from stockpilot.replay_check import REPLAYS
@@ -44,6 +45,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for t_ns, frame in replay.frames[sent:]:
             recorder.output(t_ns, frame)
         sent = len(replay.frames)
+    recorder.tap(VOLUME, inputs[-1].t_ns, flight.measure())
     recorder.close()
     write_manifest(folder)
     return folder
@@ -66,6 +68,7 @@ def test_replay_is_identical_to_the_last_bit(flown: Path) -> None:
     assert compared["odometry/estimate"]["recorded"] > 150
     assert compared["out/mavlink"]["recorded"] > 300
     assert compared["operator/command"]["recorded"] == 1
+    assert compared["volume/report"]["recorded"] == 1
     assert said["scans"] == 60
 
 
@@ -127,6 +130,10 @@ def test_report_is_set_beside_what_the_run_told(flown: Path, tmp_path: Path) -> 
         key: told[key] for key in ("keyframes", "volume_m3", "volume_interval_m3", "seen_ratio")
     }
     assert "the run itself told volume 34.50 m3, interval 30.00 to 39.00, seen 50.0%, keyframes 12" in describe(said)
+    (folder / "report.json").write_text(json.dumps(told | {"volume_interval_m3": [30.0, None]}), encoding="utf-8")
+    assert "told volume 34.50 m3, at least 30.00," in describe(
+        run(folder, "--report")[1]
+    )  # a flight that was cut short
     _, said = run(flown, "--report")
     assert said["recorded"] == {}
 

@@ -180,3 +180,9 @@ def test_pictures_of_nothing_are_drawn_too(tmp_path: Path) -> None:
         tmp_path / "t.png", outlines=[], truth_world_m=nowhere, estimated_world_m=nowhere, paper_world_m=nowhere
     )
     assert picture.is_file()
+
+
+def test_a_flight_that_was_cut_short_tells_the_least_and_no_most() -> None:
+    text = summary(REPORT | {"volume_interval_m3": [1104.4, None]})
+    assert "at least 1,104.4 m³" in text
+    assert "1,114.1" not in text

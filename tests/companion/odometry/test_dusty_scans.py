@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.odometry.ranges import THICK_BESIDE_COLUMNS, THICK_COMPANIONS, _specks
-from companion.odometry.specks import DUSTY_RATIO, lone_returns
+from companion.odometry.ranges import NEAR_M, THICK_BESIDE_COLUMNS, THICK_COMPANIONS, _specks
+from companion.odometry.specks import DUSTY_RATIO, lone_returns, off_surface
 
 COLUMNS = 512
 NOISE_M = 0.12
@@ -93,7 +93,7 @@ def test_specks_stop_nobody_where_a_thing_does(free_path_m: float) -> None:
         layer[300] = 2.0 + 0.05 * rng.standard_normal()  # a wire
         dust[200:206] = dust[300] = False
         layers.insert(0, layer)
-    is_speck = _specks(np.stack(layers))
+    is_speck = _specks(np.stack(layers), True)
     assert not is_speck[200:206].any()
     assert not is_speck[300]
     near = dust & (layers[0] < 2.5)
@@ -101,11 +101,51 @@ def test_specks_stop_nobody_where_a_thing_does(free_path_m: float) -> None:
     assert is_speck[near].mean() > 0.9
 
 
-def test_in_thick_dust_every_return_stops() -> None:
-    rng = np.random.default_rng(4)
-    layers = []
+def layers_in(free_path_m: float, seed: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """(4, 512) layers of four scans, newest first, and which returns of the newest are dust."""
+    rng = np.random.default_rng(seed)
+    layers, dust = [], np.zeros(COLUMNS, np.bool_)
     for _ in range(4):
         ranges = hall(rng)
-        dusty(ranges, 30.0, rng)
-        layers.append(np.where(ranges[0] > 0, ranges[0], np.inf).astype(np.float64))
-    assert not _specks(np.stack(layers)).any()
+        dust = dusty(ranges, free_path_m, rng)[0]
+        layers.insert(0, np.where(ranges[0] > 0, ranges[0], np.inf).astype(np.float64))
+    return np.stack(layers), dust
+
+
+def test_in_the_thickest_dust_every_near_return_stops() -> None:
+    layers, _ = layers_in(12.0, 4)
+    near = layers[0] < NEAR_M
+    assert near.sum() > 0.2 * COLUMNS
+    assert not _specks(layers, True)[near].any()
+
+
+def test_dust_farther_off_is_no_wall_to_brake_before() -> None:
+    layers, dust = layers_in(60.0, 5)
+    far = (layers[0] > NEAR_M) & (layers[0] < 8.0)
+    assert (dust & far).sum() >= 10
+    assert _specks(layers, True)[dust & far].mean() > 0.85
+    assert not _specks(layers, False)[far].any()  # clean air: what stands alone there may be a wire
+    assert _specks(layers, True)[~dust & np.isfinite(layers[0])].mean() < 0.03
+
+
+@pytest.mark.parametrize("free_path_m", [60.0, 30.0])
+def test_what_hangs_close_before_a_surface_is_told_by_it(free_path_m: float) -> None:
+    rng = np.random.default_rng(6)
+    clean = hall(rng)
+    ranges = clean.copy()
+    is_dust = dusty(ranges, free_path_m, rng)
+    before = is_dust & (clean - ranges < 2.0)
+    is_lone, _ = lone_returns(ranges)
+    is_off = off_surface(ranges, is_lone, 3.0 * NOISE_M)
+    kept = ~is_lone & ~is_off & (ranges > 0)
+    shift = np.where(before, ranges - clean, 0.0)
+    assert (~is_lone & before).sum() > 10
+    assert abs(shift[kept].mean()) < 0.5 * abs(shift[~is_lone & (ranges > 0)].mean())
+    assert is_off[~is_dust & ~is_lone & (ranges > 0)].mean() < 0.05
+
+
+def test_a_clean_slope_seen_at_a_flat_angle_keeps_its_returns() -> None:
+    rng = np.random.default_rng(7)
+    ranges = hall(rng)
+    is_off = off_surface(ranges, np.zeros(ranges.shape, np.bool_), 3.0 * NOISE_M)
+    assert is_off.mean() < 0.02

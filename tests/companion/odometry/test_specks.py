@@ -6,12 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from companion.config import LidarConfig
 from companion.messages import LidarScan, WallRanges
 from companion.odometry.attitude import AttitudeHistory
 from companion.odometry.level import Leveller
-from companion.odometry.ranges import layer_ranges, wall_ranges
+from companion.odometry.ranges import (
+    THICK_BESIDE_COLUMNS,
+    TOGETHER_M,
+    beside,
+    has_beside,
+    layer_ranges,
+    wall_ranges,
+)
+from companion.odometry.specks import LEANING
 from tests.companion.odometry.test_level import _last_scan
 
 COLUMNS = 512
@@ -79,7 +89,7 @@ def test_until_two_scans_came_before_every_return_counts(clear: tuple[LidarScan,
 
 
 @pytest.mark.parametrize(
-    ("visibility_m", "least", "most"), [(200.0, 0.0, 0.05), (100.0, 0.0, 0.15), (60.0, 0.0, 0.3), (20.0, 0.95, 1.0)]
+    ("visibility_m", "least", "most"), [(200.0, 0.0, 0.05), (100.0, 0.0, 0.15), (60.0, 0.0, 0.3), (12.0, 0.95, 1.0)]
 )
 def test_haze_is_flown_through_and_thick_dust_stops(
     clear: tuple[LidarScan, AttitudeHistory], visibility_m: float, least: float, most: float
@@ -95,3 +105,21 @@ def test_haze_is_flown_through_and_thick_dust_stops(
     raw = [layer_ranges(each).min() < 2.5 for each in dusty[2:]]
     assert np.mean(raw) > 0.9
     assert least <= np.mean(shown) <= most
+
+
+@given(st.integers(0, 1 << 32), st.integers(1, 30), st.integers(1, 4), st.sampled_from([0.0, LEANING]))
+@settings(max_examples=60, deadline=None)
+def test_companions_are_counted_only_until_there_are_enough_and_come_out_the_same(
+    seed: int, columns: int, companions: int, leaning: float
+) -> None:
+    """In rows of any length, also shorter than what is looked at: then a return is its own neighbour."""
+    rng = np.random.default_rng(seed)
+    row = rng.choice(np.array([0.0, np.inf, np.nan, 3.0, 3.1, 3.3, 9.0], dtype=np.float32), columns)
+    for c in range(columns):
+        own = float(row[c])
+        together = 0
+        for k in range(1, THICK_BESIDE_COLUMNS + 1):
+            for neighbour in (float(row[(c - k) % columns]), float(row[(c + k) % columns])):
+                together += neighbour > 0.0 and abs(neighbour - own) <= TOGETHER_M + leaning * k * own
+        assert beside(row, c, THICK_BESIDE_COLUMNS, leaning)[0] == together
+        assert has_beside(row, c, THICK_BESIDE_COLUMNS, leaning, companions) == (together >= companions)

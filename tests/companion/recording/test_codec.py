@@ -56,3 +56,12 @@ def test_every_double_comes_back(a: float, b: float) -> None:
         t_ns=0, kind=messages.SetpointKind.VELOCITY, velocity_map_mps=values, yaw_rate_radps=0.0
     )
     np.testing.assert_array_equal(codec.decode(messages.Setpoint, codec.encode(setpoint)).velocity_map_mps, values)
+
+
+def test_without_cpythons_c_encoder_the_same_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = [codec._fields_of(message) for message in one_of_each()[3:9]]
+    fast = ["".join(codec._finite_pieces(value, 0)) for value in values if "ranges_m" not in value]
+    monkeypatch.setattr(json.encoder, "c_make_encoder", None)
+    plain = codec._pieces_of(codec._unlisted)
+    assert fast
+    assert ["".join(plain(value, 0)) for value in values if "ranges_m" not in value] == fast

@@ -42,8 +42,9 @@ def heartbeats(count: int, *, v1: bool = False) -> list[bytes]:
     return out
 
 
-def a_recorder(folder: Path, **more: object) -> Recorder:
-    return Recorder(folder, metadata={"mission": "m", "seed": "3"}, attachments={"companion.json": b"{}"}, **more)  # type: ignore[arg-type]
+def a_recorder(folder: Path, *, lidar: bytes | None = None, **more: object) -> Recorder:
+    attachments = {"companion.json": b"{}"} | ({} if lidar is None else {"lidar.json": lidar})
+    return Recorder(folder, metadata={"mission": "m", "seed": "3"}, attachments=attachments, **more)  # type: ignore[arg-type]
 
 
 def fill(recorder: Recorder, seconds: int = 3) -> list[tuple[str, int, bytes, tuple[str, int] | None]]:

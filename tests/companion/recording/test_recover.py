@@ -58,7 +58,9 @@ def test_what_is_recovered_is_read_by_the_library(tmp_path: Path) -> None:
     assert found.output == tmp_path / "cut.recovered.mcap"
     reader = make_reader(io.BytesIO(found.output.read_bytes()), validate_crcs=True)
     assert len(list(reader.iter_messages())) == found.messages > 20
-    assert [m.metadata for m in reader.iter_metadata()] == [{"mission": "small"}]
+    kept = {m.name: m.metadata for m in reader.iter_metadata()}
+    assert kept["run"] == {"mission": "small"}
+    assert kept["recovered"], "what was lost is not said in it"
     assert [a.data for a in reader.iter_attachments()] == [b'{"a": 1}']
 
 

@@ -158,6 +158,17 @@ def test_heap_in_the_open_needs_no_walls() -> None:
     assert any("no closed walls" in w for w in report.warnings)
 
 
+def test_a_flight_cut_short_without_walls_tells_only_the_least(free_standing: Synthetic) -> None:
+    points = heap_in_the_open(1.0)
+    whole, part = (estimate_volume(cloud(points), CFG, is_cut_short=cut) for cut in (False, True))
+    assert part.volume_m3 == whole.volume_m3
+    assert part.interval_m3 == (whole.interval_m3[0], float("inf"))
+    assert any("cut short" in w for w in part.warnings)
+    assert not any("cut short" in w for w in whole.warnings)
+    walled = estimate_volume(free_standing.point_map, CFG, is_cut_short=True)  # all walls seen: what is missing is told
+    assert walled.interval_m3[1] < 1.1 * free_standing.true_volume_m3
+
+
 def heap_in_the_open(upwards: float) -> np.ndarray:
     rng = np.random.default_rng(3)
     xy = rng.uniform([-20, -15], [20, 15], (100_000, 2))
