@@ -17,6 +17,7 @@ from simbridge.sitl.px4 import SIMULATOR_PORT
 from stockpilot.lockstep import Lockstep
 from stockpilot.mission import load_mission
 from stockpilot.run import Prepared, prepare
+from tests.freeze import freeze
 from tests.simbridge.sitl.real_binaries import BOTH, real_binary
 
 MISSION = Path(__file__).resolve().parents[2] / "missions" / "cement_store.yaml"
@@ -169,6 +170,45 @@ def test_companion_killed_in_flight_ends_on_the_ground(kind: str) -> None:
         fly_until(run, 30.0)
         wire.is_companion_dead = True
         land(run, 90.0, drifts=kind == "ardupilot")
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_companion_frozen_in_flight_ends_on_the_ground_and_awake_again_leaves_it_there(kind: str) -> None:
+    """Its sockets stay open, so nothing bounces; awake, it first finds what the autopilot said before it landed."""
+    prepared, run, _ = runner(kind)
+    with prepared.closing:
+        fly_until(run, 30.0)
+        frozen_at = run.simulation.truth().position_world_m.copy()
+        freeze(run, lambda: run.simulation.collision or motors_stand(run), limit_s=120.0)
+        landed_at = run.simulation.truth().position_world_m.copy()
+        if run.simulation.collision:  # blind for more than 8 s, as when the companion is killed
+            assert kind == "ardupilot"
+            return
+        assert np.linalg.norm((landed_at - frozen_at)[:2]) < (2.0 if kind == "px4" else 12.0)
+        awake_ns = run.simulation.t_ns
+        while run.simulation.t_ns < awake_ns + 10e9:
+            run.step()
+            assert motors_stand(run)
+    assert not run.flight.session.vehicle_state(run.t_ns).is_armed
+
+
+@pytest.mark.parametrize("kind", BOTH)
+def test_companion_frozen_for_3_s_in_flight_ends_on_the_ground(kind: str) -> None:
+    """PX4 has begun to land when it wakes: it leaves it the vehicle. ArduPilot has noticed nothing yet; the companion has."""
+    prepared, run, _ = runner(kind)
+    with prepared.closing:
+        fly_until(run, 30.0)
+        wakes_ns = run.simulation.t_ns + 3_000_000_000
+        freeze(run, lambda: run.simulation.t_ns >= wakes_ns, limit_s=5.0)
+        if kind == "px4":
+            seconds_until(run, FlightMode.LAND, 2.0)
+        land(run, 400.0, drifts=kind == "ardupilot")
+        if kind == "px4":
+            assert "taken_over" in [event.name for event in prepared.flight.events]
+
+
+def motors_stand(run: Lockstep) -> bool:
+    return not run.simulation._autopilot.motors.any()
 
 
 @pytest.mark.parametrize("kind", BOTH)
