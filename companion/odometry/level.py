@@ -94,7 +94,8 @@ def wall_layer(
     spacing_m = LOW_SPACING_M if is_climbing and z_m < LOW_M else 0.0
     row = geometry.horizontal_row
     below, lowest = (_row_below(geometry.elevation_rad, row, n * BELOW_RAD) for n in (1, 2))
-    rows = (row, below, lowest) if z_m < NO_PILE_ABOVE_M else (row, -1, -1)
+    is_asked = z_m < NO_PILE_ABOVE_M and math.isfinite(above_m)  # a floor that is not known yet would pass for a slope
+    rows = (row, below, lowest) if is_asked else (row, -1, -1)
     return lk.upright_layer(
         levelled.points_level,
         levelled.row,

@@ -105,6 +105,13 @@ def test_standing_every_return_above_the_floor_counts() -> None:
     assert on_slope(layer) > 0.9 * len(pile)
 
 
+def test_while_the_floor_is_not_known_nothing_is_taken_for_a_slope() -> None:
+    """The first scan may come before the rangefinder has told the floor: the layer below ends there, a metre off."""
+    scan, geometry, _ = seen_from(0.3, np.random.default_rng(4))
+    layer = wall_layer(scan, geometry, -math.inf, 0.0, NOISE_M, is_climbing=False)
+    assert len(layer) == int((scan.row == 0).sum())
+
+
 def test_at_the_height_of_flight_every_return_may_be_a_wall() -> None:
     scan, geometry, _ = seen_from(NO_PILE_ABOVE_M + 1.0, np.random.default_rng(2))
     layer = wall_layer(scan, geometry, -NO_PILE_ABOVE_M, NO_PILE_ABOVE_M + 1.0, NOISE_M, is_climbing=True)
