@@ -29,6 +29,7 @@ from companion.messages import (
     OdometryEstimate,
     OperatorCommand,
     OperatorCommandKind,
+    PointMap,
     RangefinderSample,
     Setpoint,
     SetpointKind,
@@ -221,12 +222,14 @@ class Flight:
     def is_finished(self) -> bool:
         return self.navigation is not None and self.navigation.finished
 
-    def measure(self) -> VolumeReport:
-        """The volume from the map so far: seconds of work."""
+    def measure(self, point_map: PointMap | None = None) -> VolumeReport:
+        """The volume from the map so far: seconds of work. point_map: where the caller has it already."""
         from companion.volume import estimate_volume  # not before: what it needs of scipy takes a second to load
 
         cut_short = self.navigation is not None and not self.navigation.lap_closed
-        return estimate_volume(self.mapper.point_map(), self.config.volume, is_cut_short=cut_short)
+        if point_map is None:
+            point_map = self.mapper.point_map()
+        return estimate_volume(point_map, self.config.volume, is_cut_short=cut_short)
 
     # ---- within -----------------------------------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ def score_flight(
 ) -> Scored:  # fmt: skip
     """Score both pipelines of one flight. See issue and docs for the keys of the report."""
     point_map = flight.mapper.point_map()
-    volume = flight.measure() if len(point_map.points_map) else None
+    volume = flight.measure(point_map) if len(point_map.points_map) else None
     began_ns = outcome.estimates[0].t_scan_ns if outcome.estimates else int(outcome.truth.t_ns[0])
     pin = pin_map(outcome.truth, began_ns)
     keyframes = [result.estimate for _, result in outcome.keyframe_scans]

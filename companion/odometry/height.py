@@ -100,14 +100,13 @@ class HeightTracker:
         self, lower: Array, planar: kalman.Planar, vertical: kalman.Vertical, walls: WallMap, sigma_m: float
     ) -> HeightFit:
         shift = planar.p[:2, :2] + np.eye(2) * SHIFT_SIGMA_M**2
-        sigma_z = math.sqrt(float(vertical.p[0, 0]))
         return self.ground.fit(
             lower,
             planar.x[kalman.POSE],
             float(vertical.x[0]),
             walls,
             sigma_range_m=BLOCK_SIGMA_RATIO * sigma_m,
-            gate_m=0.5 + 3.0 * sigma_z,
+            gate_m=_ground_gate_m(vertical),
             seen_spread_m=self._highest_m,
             tilt_information=np.asarray(np.linalg.inv(self._tilt_p), np.float64),
             shift_information=np.asarray(np.linalg.inv(shift), np.float64),
@@ -125,7 +124,6 @@ class HeightTracker:
     ) -> tuple[float, float]:
         """How far the body is off along axis, (2,) in map, by the slopes of the ground, and the information about that; after
         `update` of the same scan, which found its tilt (2,)."""
-        sigma_z = math.sqrt(float(vertical.p[0, 0]))
         return self.ground.shift_along(
             lower,
             planar.x[kalman.POSE],
@@ -133,9 +131,9 @@ class HeightTracker:
             walls,
             axis,
             tilt=tilt,
-            variances=np.append(sigma_z**2, np.diag(self._tilt_p) + BEND_SIGMA_RAD**2),
+            variances=np.append(vertical.p[0, 0], np.diag(self._tilt_p) + BEND_SIGMA_RAD**2),
             sigma_range_m=BLOCK_SIGMA_RATIO * sigma_m,
-            gate_m=0.5 + 3.0 * sigma_z,
+            gate_m=_ground_gate_m(vertical),
             seen_spread_m=self._highest_m,
         )
 
@@ -204,3 +202,8 @@ class HeightTracker:
             return vertical
         variance = RANGEFINDER_SIGMA_M**2 + (0.01 * newest.distance_m) ** 2
         return kalman.update_vertical(vertical, float(z), variance)
+
+
+def _ground_gate_m(vertical: kalman.Vertical) -> float:
+    """How far a point may be off the known ground."""
+    return 0.5 + 3.0 * math.sqrt(float(vertical.p[0, 0]))
