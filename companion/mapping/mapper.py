@@ -13,7 +13,6 @@ from companion.mapping.outliers import is_solid
 from companion.messages import Array, LevelledScan, OdometryEstimate, PointMap
 
 MAX_POINTS = 3_000_000  # about 60 MB; a lap of the cement store is 1.4 million
-FIRST_VOXEL_M = 0.05
 MAX_JUMP_SIGMA_M = 1.0  # a pose less certain than this paints nothing
 
 
@@ -41,7 +40,7 @@ class Mapper:
         self._max_range_m = min(cfg.mapping.max_range_m, cfg.lidar.max_range_m)
         self._keyframes: dict[int, _Keyframe] = {}
         self._max_points = max_points
-        self._voxel_m = FIRST_VOXEL_M
+        self._one_of = 1
         self._size = 0
         self._variances: list[tuple[float, float]] = []
         self.scans_added = 0
@@ -63,8 +62,8 @@ class Mapper:
         in_range = finite & (levelled.range_m >= self._min_range_m) & (levelled.range_m <= self._max_range_m)
         solid = is_solid(levelled, finite)
         self.points_dropped_as_dust += int((in_range & ~solid).sum())
-        keep = in_range & solid
-        if not keep.any():
+        keep = np.flatnonzero(in_range & solid)[self.scans_added % self._one_of :: self._one_of]
+        if len(keep) == 0:
             self.scans_refused += 1
             return False
         keyframe = self._keyframe(estimate)
@@ -73,7 +72,7 @@ class Mapper:
         to_keyframe = matrix_from_quat(keyframe.q_map_body_wxyz)  # rows of points times R is R transposed times columns
         keyframe.points.append(((points_map - keyframe.position_map_m) @ to_keyframe).astype(np.float32))
         keyframe.range_m.append(levelled.range_m[keep].astype(np.float32))
-        keyframe.seen_from.append(np.full(int(keep.sum()), len(keyframe.path), np.int32))
+        keyframe.seen_from.append(np.full(len(keep), len(keyframe.path), np.int32))
         keyframe.path.append((estimate.position_map_m - keyframe.position_map_m) @ to_keyframe)
         self._variances.append(
             (
@@ -81,7 +80,7 @@ class Mapper:
                 float(estimate.pose_covariance[2, 2]),
             )
         )
-        self._size += int(keep.sum())
+        self._size += len(keep)
         self.scans_added += 1
         if self._size > self._max_points:
             self._thin()
@@ -127,22 +126,16 @@ class Mapper:
         return keyframe
 
     def _thin(self) -> None:
-        """Keep the first return of each voxel of each keyframe, with voxels that grow until the map fits.
-
-        The first, not the mean: a mean would hide from the volume how far the returns scatter.
-        """
+        """Keep one of two returns of each scan, from now on too: chosen by their order alone, so that nothing that is seen
+        weighs more than before (of voxels that hold one return each, most would be on the rim of the noise)."""
         before = self._size
-        while self._size > 0.75 * self._max_points:
-            for keyframe in self._keyframes.values():
-                points, ranges = np.concatenate(keyframe.points), np.concatenate(keyframe.range_m)
-                seen_from = np.concatenate(keyframe.seen_from)
-                voxel = np.floor(points.astype(np.float64) / self._voxel_m).astype(np.int64)
-                _, first = np.unique(_voxel_key(voxel), return_index=True)
-                first.sort()
-                keyframe.points, keyframe.range_m = [points[first]], [ranges[first]]
-                keyframe.seen_from = [seen_from[first]]
-            self._size = sum(k.size for k in self._keyframes.values())
-            self._voxel_m *= 1.5
+        for keyframe in self._keyframes.values():
+            kept = [slice(k % 2, None, 2) for k in range(len(keyframe.points))]
+            keyframe.points = [np.ascontiguousarray(a[k]) for a, k in zip(keyframe.points, kept, strict=True)]
+            keyframe.range_m = [np.ascontiguousarray(a[k]) for a, k in zip(keyframe.range_m, kept, strict=True)]
+            keyframe.seen_from = [np.ascontiguousarray(a[k]) for a, k in zip(keyframe.seen_from, kept, strict=True)]
+        self._size = sum(k.size for k in self._keyframes.values())
+        self._one_of *= 2
         self.points_thinned += before - self._size
 
 
@@ -157,8 +150,3 @@ def _about_z(yaw_rad: float) -> Array:
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
-
-def _voxel_key(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One integer for each voxel within about 50 km of the keyframe at 5 cm."""
-    offset = voxel + (1 << 20)
-    return np.asarray((offset[:, 0] << 42) | (offset[:, 1] << 21) | offset[:, 2])

@@ -20,11 +20,13 @@ GRAVITY = 9.80665
 MAX_ACCELERATION = 3.0  # m/s^2 that tilt is believed to give
 VELOCITY_NOISE = 0.08  # m/s per sqrt(s): what neither tilt nor b explains
 ACCELERATION_WALK = 0.15  # m/s^2 per sqrt(s)
-YAW_NOISE = 0.001  # rad per sqrt(s)
-GYRO_WALK = 2e-5  # rad/s per sqrt(s)
+YAW_NOISE = 3e-4  # rad per sqrt(s): of the gyro, and of when its samples and the scans were
+GYRO_TURN_NOISE = 4e-3  # rad per sqrt(rad) turned: a scale that is 0.3 % off, over a quarter turn
+GYRO_WALK = 1e-5  # rad/s per sqrt(s)
 STEP_S = 0.02
 MAX_STEPS = 250
 N = 8
+YAW = 6  # in the state; its rate's offset comes after it
 
 
 class Planar(NamedTuple):
@@ -58,13 +60,13 @@ def _carry(
         x[2] += ax * step_s
         x[3] += ay * step_s
         x[6] += gyro_yaw - before - x[7] * step_s
-        _spread(p, step_s)
+        _spread(p, step_s, abs(gyro_yaw - before))
     return x, p
 
 
 @kernel
-def _spread(p: Array, step_s: float) -> None:
-    """F P F' plus noise, in place. F is the unit matrix and: position from velocity, velocity from b, yaw from offset."""
+def _spread(p: Array, step_s: float, turned_rad: float) -> None:
+    """F P F' plus noise, in place, of a step in which it turned by so much. F is the unit matrix and: position from velocity, velocity from b, yaw from offset."""
     for k in range(N):
         for i in range(4):
             p[i, k] += step_s * p[i + 2, k]
@@ -76,7 +78,7 @@ def _spread(p: Array, step_s: float) -> None:
     for k in range(2):
         p[2 + k, 2 + k] += VELOCITY_NOISE**2 * step_s
         p[4 + k, 4 + k] += ACCELERATION_WALK**2 * step_s
-    p[6, 6] += YAW_NOISE**2 * step_s
+    p[6, 6] += YAW_NOISE**2 * step_s + GYRO_TURN_NOISE**2 * turned_rad
     p[7, 7] += GYRO_WALK**2 * step_s
 
 
@@ -108,9 +110,19 @@ POSE_BLOCK = np.ix_(POSE, POSE)
 
 
 def update(
-    state: Planar, pose: Array, information: Array, apparent: Array, prior_information: Array, floor_variance: Array
+    state: Planar,
+    pose: Array,
+    information: Array,
+    apparent: Array,
+    prior_information: Array,
+    floor_variance: Array,
+    *,
+    holds_yaw: bool = False,
 ) -> Planar:
     """Fuse a registration that was found with a prior about the state's own pose.
+
+    holds_yaw: leave yaw to the gyro as it is, and take x and y as seen from that yaw. (Where little tells of
+    yaw, what many scans seem to tell of it is the error of their normals, adding up.)
 
     pose: (3,) where points and prior agree. information: (3, 3) of the points alone, may be singular.
     apparent: (3, 3) the information that the registration itself went by.
@@ -118,19 +130,35 @@ def update(
     """
     x, p = _update(
         state.x, state.p, pose, np.ascontiguousarray(information), np.ascontiguousarray(apparent), prior_information,
-        floor_variance,
+        floor_variance, holds_yaw,
     )  # fmt: skip
     return Planar(state.t_ns, x, p)
 
 
 @kernel
 def _update(
-    x: Array, p: Array, pose: Array, information: Array, apparent: Array, prior: Array, floor_variance: Array
+    x: Array,
+    p: Array,
+    pose: Array,
+    information: Array,
+    apparent: Array,
+    prior: Array,
+    floor_variance: Array,
+    holds_yaw: bool,
 ) -> tuple[Array, Array]:
     """State (8,) and covariance (8, 8) after a registration; arguments as of `update`, matrices C-contiguous."""
     off = np.array([pose[0] - x[0], pose[1] - x[1], pose[2] - x[6]])
     shift = (apparent + prior) @ off  # = apparent (ML pose - state's pose)
     gradient = information @ np.linalg.solve(apparent + 1e-3 * np.eye(3), shift)
+    if holds_yaw:
+        information = np.zeros((3, 3))
+        information[:2, :2] = apparent[:2, :2]
+        gradient = np.array([shift[0], shift[1], 0.0])
+        p = p.copy()
+        p[:YAW, YAW:] = 0.0
+        p[YAW:, :YAW] = 0.0
+        x = x.copy()
+        x[YAW + 1] = 0.0  # the flight controller has taken it out, by the yaw that we told it: twice would run away
     discount = np.linalg.inv(np.eye(3) + information * floor_variance)
     information = discount @ information
     total = np.linalg.inv(p)
@@ -184,11 +212,13 @@ def update_vertical(state: Vertical, z_m: float, variance: float) -> Vertical:
     return Vertical(state.t_ns, np.array([z + gain_z * off, vz + gain_v * off]), p)
 
 
-def let_go(state: Planar, gyro_offset_radps: float, stood_s: float) -> Planar:
-    """Standing has just ended: near the origin still, and slow; what the gyro read meanwhile is its offset."""
+def let_go(state: Planar, gyro_offset_radps: float, stood_s: float, turned_rad: float) -> Planar:
+    """Standing has just ended: near the origin still, and slow; what the gyro read meanwhile is its offset. turned_rad: by
+    the gyro, since it surely stood."""
     offset_sigma = min(2e-3, max(3e-5, 6e-4 / max(stood_s, 1e-3) ** 0.5))
-    sigma = np.array([0.01, 0.01, 0.05, 0.05, 0.1, 0.1, 0.005, offset_sigma])
+    sigma = np.array([0.01, 0.01, 0.05, 0.05, 0.1, 0.1, 0.0005, offset_sigma])
     x = np.zeros(N)
+    x[6] = turned_rad
     x[7] = gyro_offset_radps
     return Planar(state.t_ns, x, np.diag(sigma**2))
 

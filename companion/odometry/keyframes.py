@@ -9,10 +9,10 @@ import numpy as np
 from companion.geometry import rotation2
 from companion.messages import Array
 from companion.odometry.height_map import HeightMap
+from companion.odometry.standstill import NOTICED_LATE
 from companion.odometry.wall_map import WallMap
 
 MOST_WAITING = 100  # scans kept until the next keyframe
-STANDING_DELAY = 10  # scans: motion is noticed late, so what is put into the first keyframe is this old
 
 
 class PlacedScan(NamedTuple):
@@ -38,11 +38,11 @@ class WaitingScans:
 
     def drop_moved(self) -> None:
         """It no longer stands, and has not for about as long as it takes to notice."""
-        del self._scans[-STANDING_DELAY:]
+        del self._scans[-NOTICED_LATE:]
 
     def put_into(self, walls: WallMap, ground: HeightMap, sigma_range_m: float, *, is_standing: bool) -> None:
         """Put them into the maps; while standing the newest wait on, since motion is noticed late."""
-        count = len(self._scans) - (STANDING_DELAY if is_standing else 0)
+        count = len(self._scans) - (NOTICED_LATE if is_standing else 0)
         ready, self._scans = self._scans[:count], self._scans[count:]
         for scan in ready:
             r = rotation2(float(scan.pose[2])).T

@@ -47,6 +47,7 @@ FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
 WAIT_FOR_FIRST_SCANS = 5
 MIN_VALID_COLUMNS_FIRST_RATIO = 0.75  # the first scan makes the map: one that was joined in mid-turn would ruin it
+LEAST_NOISE_RATIO = 0.8  # of the noise of single returns: oblique ones err less across their wall
 SUDDEN_LOSS = 0.15  # share of the layer's points that lose their wall at once
 MIN_JUMP_M = 0.2
 DUST_SIGMA_M = 0.05  # of x and y, were all returns dust: what is left of it before the walls shrinks the map
@@ -287,7 +288,10 @@ class Odometry:
             self._accepted += 1
             self._track_noise(registration.scale)
             seen, apparent = registration.information, registration.apparent_information
-            planar = kalman.update(planar, registration.pose, seen, apparent, prior, FLOOR_VARIANCE)
+            held = judgement.is_yaw_weak
+            planar = kalman.update(
+                planar, registration.pose, seen, apparent, prior, FLOOR_VARIANCE, holds_yaw=held
+            )
             was_weak, self._is_weak = self._is_weak, False
             return planar, registration, judgement, was_weak and _is_jump(planar.x, guess)
         self._rejected_in_row += 1
@@ -373,9 +377,11 @@ class Odometry:
         return _is_jump(found.pose, registration.pose)
 
     def _track_noise(self, scale: float) -> None:
-        """Learn the range noise from the residuals: fast at first, then slowly."""
+        """Learn the range noise from the residuals: fast at first, then slowly; it is no less than that of returns. (In a
+        climb residuals are small beside what walls may lean by, and tell of no noise.)"""
         rate = max(0.01, 0.3 / (1 + self._accepted / 5))
-        self._sigma_range_m = min(max(self._sigma_range_m * scale**rate, 0.01), 0.5)
+        least = max(0.01, LEAST_NOISE_RATIO * self._return_noise.sigma_m)
+        self._sigma_range_m = min(max(self._sigma_range_m * scale**rate, least), 0.5)
 
     def _stand(
         self,
@@ -403,7 +409,8 @@ class Odometry:
         self._base_variance = noise / max(1, self._standing_scans)
         self._waiting.drop_moved()
         still = self._standstill
-        return kalman.let_go(planar, still.gyro_offset_radps, still.stood_s), kalman.let_go_vertical(vertical, z_shift)
+        planar = kalman.let_go(planar, still.gyro_offset_radps, still.stood_s, still.turned_rad)
+        return planar, kalman.let_go_vertical(vertical, z_shift)
 
     def _after(
         self,
@@ -427,6 +434,8 @@ class Odometry:
         if accepted:
             dust = (DUST_SIGMA_M * self._dust_ratio) ** 2
             planar_map = registration.map_variance + self._base_variance + np.array([dust, dust, 0.0])
+            if judgement.is_yaw_weak:
+                planar_map += np.append(registration.per_yaw_m**2, 0.0) * planar.p[kalman.YAW, kalman.YAW]
         quality = max(1, min(100, round(100 * registration.matched_ratio))) if accepted else old.quality
         if judgement.is_degenerate:
             quality = weak.quality_at(weak.sigma_along(planar, judgement.weak_axis), quality)

@@ -10,6 +10,7 @@ from companion.messages import Array
 from companion.odometry.attitude import AttitudeHistory
 
 RECENT = 5  # scans over which a shift is averaged
+NOTICED_LATE = 10  # scans: motion is noticed by then
 MAX_RATE_RADPS = 0.2
 MAX_TILT_CHANGE_RAD = 0.06
 MAX_RANGEFINDER_CHANGE_M = 0.08
@@ -29,6 +30,15 @@ class Standstill:
         self._since: tuple[int, float] | None = None  # time and gyro yaw when it began
         self.stood_s = 0.0
         self.gyro_offset_radps = 0.0
+        self._yaws: deque[tuple[int, float]] = deque(maxlen=NOTICED_LATE)  # time and gyro yaw of the last scans
+
+    @property
+    def turned_rad(self) -> float:
+        """By the gyro, since it surely stood."""
+        if not self._yaws:
+            return 0.0
+        (since_ns, since), (t_ns, yaw) = self._yaws[0], self._yaws[-1]
+        return yaw - since - self.gyro_offset_radps * (t_ns - since_ns) * 1e-9
 
     @property
     def rangefinder_m(self) -> float | None:
@@ -56,6 +66,7 @@ class Standstill:
         if self._tilt is None:
             self._tilt = tilt
         self._shifts.append(shift)
+        self._yaws.append((int(history.t_ns[-1]), float(history.values[-1, 2])))
         mean = np.mean(self._shifts, axis=0)
         limit = np.maximum(MIN_SHIFT, SHIFT_SIGMAS * sigma / np.sqrt(len(self._shifts)))
         moved = (

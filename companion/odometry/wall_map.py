@@ -5,6 +5,7 @@ Nothing is forgotten and all scans weigh alike, so the walls seen first keep anc
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,10 @@ import numpy as np
 from companion.messages import Array
 from companion.odometry import kernels
 from companion.odometry.grid_growth import growth
+
+# 1/rad2: information about yaw, x and y left free, below which it is doubted: a hall's walls give twenty times as much; so
+# little comes from a few things in a round store that are no straight walls, and errs alike from scan to scan.
+WEAK_YAW = 1.0 / math.radians(0.1) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +37,11 @@ class Registration:
     matched_ratio: float
     scale: float
     map_variance: Array
+
+    @property
+    def per_yaw_m(self) -> Array:
+        """(2,) by how much x and y change, in m, with each rad that yaw is off: in a round store, the way to its middle."""
+        return np.linalg.solve(self.apparent_information[:2, :2] + np.eye(2), -self.apparent_information[:2, 2])
 
 
 class WallMap:
@@ -96,6 +106,8 @@ class WallMap:
         )
         believed = information.copy()
         believed[2, 2] -= out[9]
+        of_yaw = kernels.without_translation(believed)
+        believed[2, 2] -= of_yaw * WEAK_YAW / (of_yaw + WEAK_YAW)
         return Registration(
             pose=pose,
             information=believed,
