@@ -19,14 +19,15 @@ _quaternion, _rotation = kernel(quat_from_rpy), kernel(rotation_matrix)
 
 
 class Snapshot(NamedTuple):
-    """Immutable state after a scan; map_variance: (4,) of the map itself where it was used, x, y, yaw, z."""
+    """Immutable state after a scan; map_variance: (4,) of the map itself where it was used, x, y, yaw, z; drift_variance: of
+    z, by the tilt that the ground's map was built with."""
 
     t_scan_ns: int
     planar: Planar
     vertical: Vertical
     map_variance: Array
     tilt_offset_rad: tuple[float, float]
-    tilt_variance: float
+    drift_variance: float
     quality: int
     reset_counter: int
     converged: bool
@@ -41,8 +42,9 @@ def estimate_at(snapshot: Snapshot, history: AttitudeHistory, t_ns: int, *, is_s
     """The estimate carried on to t_ns (not before the snapshot), its covariance grown accordingly."""
     planar = carry(snapshot.planar, history, t_ns)
     vertical = carry_vertical(snapshot.vertical, t_ns)
+    map_variance = snapshot.map_variance + np.array([0.0, 0.0, 0.0, snapshot.drift_variance])
     position, q, velocity_body, pose_covariance, velocity_covariance = _seen_from_outside(
-        planar.x, planar.p, vertical.x, vertical.p, snapshot.map_variance, t_ns, history.t_ns, history.values,
+        planar.x, planar.p, vertical.x, vertical.p, map_variance, t_ns, history.t_ns, history.values,
         *snapshot.tilt_offset_rad,
     )  # fmt: skip
     return OdometryEstimate(

@@ -12,6 +12,7 @@ from companion.messages import Array, RangefinderSample
 from companion.odometry import filter as kalman
 from companion.odometry.attitude import AttitudeHistory
 from companion.odometry.height_map import BEND_SIGMA_RAD, HeightFit, HeightMap
+from companion.odometry.tilt import Tilt
 from companion.odometry.wall_map import WallMap
 
 BLOCK_SIGMA_RATIO = 0.5  # means of blocks of about four returns
@@ -24,11 +25,7 @@ START_CELLS = 6
 GATE_SIGMAS = 5.0
 MIN_GATE_M = 0.1
 MIN_GROUND_POINTS = 20
-TILT_WALK = 0.0015  # rad per sqrt(s): how fast the attitude's error wanders
-TILT_SIGMA_RAD = 0.01  # how large it is thought to be
 SHIFT_SIGMA_M = 0.008  # of x and y beside their covariance: lines are a little off too
-TILT_FLOOR_RAD = 0.0002
-MAX_TILT_RAD = math.radians(4.0)
 MAX_REJECTED = 10
 CONTRADICTED_M = 0.5  # by which the rangefinder may differ from a height that was refused before (dust)
 FRESH_NS = 500_000_000  # age of a reading that still counts
@@ -57,15 +54,18 @@ class HeightTracker:
         self._rangefinder: deque[RangefinderSample] = deque(maxlen=64)
         self._rest_m, self._rests = 0.0, 0  # mean reading while standing, and of how many
         self._floor_m: float | None = None  # by the LiDAR, once it has left the ground
-        self._tilt = np.zeros(2)
-        self._tilt_p = np.eye(2) * TILT_SIGMA_RAD**2
+        self._tilt = Tilt()
         self._highest_m = 0.0
         self._rejected = 0
         self._t_ns = 0
 
     @property
     def tilt_offset_rad(self) -> tuple[float, float]:
-        return float(self._tilt[0]), float(self._tilt[1])
+        return float(self._tilt.offset[0]), float(self._tilt.offset[1])
+
+    def drift_variance(self) -> float:
+        """Of z where the body is, m2, by the tilt that the ground's map was built with on the way there."""
+        return self._tilt.drift_variance()
 
     @property
     def floor_m(self) -> float | None:
@@ -108,7 +108,8 @@ class HeightTracker:
             sigma_range_m=BLOCK_SIGMA_RATIO * sigma_m,
             gate_m=_ground_gate_m(vertical),
             seen_spread_m=self._highest_m,
-            tilt_information=np.asarray(np.linalg.inv(self._tilt_p), np.float64),
+            lean=self._tilt.lean,
+            tilt_information=np.asarray(np.linalg.inv(self._tilt.p), np.float64),
             shift_information=np.asarray(np.linalg.inv(shift), np.float64),
         )
 
@@ -131,7 +132,7 @@ class HeightTracker:
             walls,
             axis,
             tilt=tilt,
-            variances=np.append(vertical.p[0, 0], np.diag(self._tilt_p) + BEND_SIGMA_RAD**2),
+            variances=np.append(vertical.p[0, 0], np.diag(self._tilt.p)[:2] + BEND_SIGMA_RAD**2),
             sigma_range_m=BLOCK_SIGMA_RATIO * sigma_m,
             gate_m=_ground_gate_m(vertical),
             seen_spread_m=self._highest_m,
@@ -150,7 +151,7 @@ class HeightTracker:
         vertical = self._use_rangefinder(vertical, planar.x[kalman.POSE], history)
         dt_s = max(0.0, (vertical.t_ns - self._t_ns) * 1e-9) if self._t_ns else 0.0
         self._t_ns = vertical.t_ns
-        self._tilt_p = self._tilt_p + np.eye(2) * TILT_WALK**2 * dt_s
+        self._tilt.carry(dt_s, np.append(planar.x[:2], vertical.x[0]))
         fit = self.fit(lower, planar, vertical, walls, sigma_m)
         self._highest_m = max(self._highest_m, float(vertical.x[0]))
         sigma_z = math.inf
@@ -167,9 +168,9 @@ class HeightTracker:
                 self._rejected = 0
             else:
                 self._rejected += 1
-        self._track_tilt(fit, dt_s)
+        self._tilt.take(fit)
         ground = fit.new_ground
-        result = HeightResult(fit.correction, sigma_z, ground, fit.ground_points, fit.wall_points)
+        result = HeightResult(fit.correction[:3], sigma_z, ground, fit.ground_points, fit.wall_points)
         return vertical, result
 
     def _over_ground(self, pose: Array) -> float | None:
@@ -178,14 +179,6 @@ class HeightTracker:
         if known is None or not self._rangefinder or self._t_ns - self._rangefinder[-1].t_ns > FRESH_NS:
             return None
         return known[0] + self._rangefinder[-1].distance_m
-
-    def _track_tilt(self, fit: HeightFit, dt_s: float) -> None:
-        """Take over what the walls told of the tilt, beside a random walk that is drawn back to 0."""
-        back = min(1.0, dt_s * (TILT_WALK / TILT_SIGMA_RAD) ** 2 / 2)
-        tilt = (self._tilt + fit.correction[1:]) * (1.0 - back)
-        self._tilt = np.clip(tilt, -MAX_TILT_RAD, MAX_TILT_RAD)
-        self._tilt_p = np.asarray(np.linalg.inv(np.linalg.inv(self._tilt_p) + fit.information[1:, 1:]), np.float64)
-        self._tilt_p += np.eye(2) * TILT_FLOOR_RAD**2
 
     def _use_rangefinder(self, vertical: kalman.Vertical, pose: Array, history: AttitudeHistory) -> kalman.Vertical:
         """Above the start the reading, made plumb, is the height: the floor there is known from standing on it."""

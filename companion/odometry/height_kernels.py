@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from companion.jit import kernel
 from companion.messages import Array
+from companion.odometry.jackknife import SECTORS, TUKEY, shared_by_sector
 
 WINDOW = 1
 W, X, Y, Z, XX, XY, YY, XZ, YZ, ZZ, VZ = range(11)
@@ -23,13 +24,13 @@ LEAN_M2 = 0.012  # spread along the beam that is noise and must not pass for slo
 SURFACE_SIGMA_M = 0.03
 TILT_FAR_RAD = 0.0015  # attitude error that a far point's height is thought to carry into the map
 CORRELATED = 8.0
-TUKEY = 4.685
 UNKNOWN, GROUND, WALL = 0, 1, 2
 WALL_FOOT_M = 0.7  # a wall point must be this far above the ground to count as one
 WALL_GATE_M = 0.5
 WALL_SPREAD_M = 1.0  # of heights at which a wall must have been seen to count as plumb
 MIN_SHIFT_POINTS = 50
 LEAST_SLOPE = 0.25  # along the axis: the floor's noise looks like less, and would tell of places that nobody knows
+LOOSE_RAD = 0.02  # holds a tilt that hardly any wall tells
 BESIDE_M = 1.2  # where the ground at a wall's foot is not known, it is looked for this far before the wall
 
 
@@ -248,11 +249,12 @@ def _solve_robustly(jac: Array, res: Array, var: Array, prior: Array, iterations
 
 @kernel
 def _wall_rows(
-    standing: Array, points: Array, pose: Array, kind: NDArray[np.int64], sigma_range_m: float
-) -> tuple[Array, Array, Array]:
-    """Residuals of the points on walls by roll, pitch and a shift (map x, y) of the body."""
+    standing: Array, points: Array, pose: Array, kind: NDArray[np.int64], sigma_range_m: float, lean: Array
+) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Residuals of the points on walls by roll, pitch, what the walls lean by (turn about map x, y) and a shift (map x, y) of
+    the body; their variance, and in which of SECTORS of the turn they lie."""
     n = np.sum(kind == WALL)
-    jac, res, var = np.zeros((n, 4)), np.zeros(n), np.zeros(n)
+    jac, res, var, sector = np.zeros((n, 6)), np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     k = 0
     for i in range(points.shape[0]):
@@ -262,12 +264,14 @@ def _wall_rows(
         x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
         wall = standing[i]
         ax, ay = c * wall[2] + s * wall[3], -s * wall[2] + c * wall[3]
-        res[k] = wall[2] * (x - wall[4]) + wall[3] * (y - wall[5])
-        jac[k, 0], jac[k, 1], jac[k, 2], jac[k, 3] = -ay * pz, ax * pz, wall[2], wall[3]
+        jac[k, 0], jac[k, 1], jac[k, 4], jac[k, 5] = -ay * pz, ax * pz, wall[2], wall[3]
+        jac[k, 2], jac[k, 3] = -wall[3] * pz, wall[2] * pz
+        res[k] = wall[2] * (x - wall[4]) + wall[3] * (y - wall[5]) + jac[k, 2] * lean[0] + jac[k, 3] * lean[1]
         along = (ax * px + ay * py) / max(math.sqrt(px * px + py * py + pz * pz), 1e-6)
         var[k] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * wall[6]
+        sector[k] = math.floor((math.atan2(py, px) / (2.0 * math.pi) + 0.5) * SECTORS) % SECTORS
         k += 1
-    return jac, res, var
+    return jac, res, var, sector
 
 
 @kernel
@@ -315,6 +319,7 @@ def fit_height(
     kind: NDArray[np.int64],
     place: NDArray[np.int64],
     sigma_range_m: float,
+    lean: Array,
     tilt_prior: Array,
     shift_prior: Array,
     bend_variance: float,
@@ -322,28 +327,34 @@ def fit_height(
 ) -> tuple[Array, Array, Array]:
     """Tilt from the points on walls, then z from those on the ground.
 
-    Walls are plumb, the ground's map is only as level as it was built: so the ground does not tell tilt, and z is fitted
-    with a slope of its own of that variance beside it. The body's place is a little off too, which must not pass for
-    tilt: it is fitted beside it.
+    Walls are plumb but for what their bumps make them lean by; the ground's map is only as level as it was built: so the
+    ground does not tell tilt, and z is fitted with a slope of its own of that variance beside it. The body's place is a
+    little off too, which must not pass for tilt: it is fitted beside it.
 
-    tilt_prior, shift_prior: (2, 2) information about roll, pitch and about x, y. Returns: (3,) correction of z, roll,
-    pitch; (3, 3) information: of z alone, and of the tilt by the walls; (4,) ground points, wall points, scale, mean
-    pose variance of the planes used.
+    lean: (2,) of the walls in sight, turn about map x and y, as believed. tilt_prior, shift_prior: (4, 4) information about
+    roll, pitch and lean, (2, 2) about x, y. Returns: (5,) correction of z, roll, pitch, lean; (5, 5) information: of z
+    alone, and of tilt and lean by the walls; (6,) ground points, wall points, scale, mean pose variance of the planes
+    used, variance of the tilt by walls of independent errors, and how many times that their bumps add.
     """
-    out = np.zeros(4)
-    correction, information = np.zeros(3), np.zeros((3, 3))
-    jac, res, var = _wall_rows(standing, points, pose, kind, sigma_range_m)
+    out = np.zeros(6)
+    correction, information = np.zeros(5), np.zeros((5, 5))
+    jac, res, var, sector = _wall_rows(standing, points, pose, kind, sigma_range_m, lean)
     out[1] = len(res)
-    prior = np.zeros((4, 4))
-    prior[:2, :2] = tilt_prior
-    prior[2:, 2:] = shift_prior
+    prior = np.zeros((6, 6))
+    prior[:4, :4] = tilt_prior
+    prior[4:, 4:] = shift_prior
     if len(res) > 0:
-        tilt, h, _ = _solve_robustly(jac, res, var, prior, iterations)
-        correction[1:] = tilt[:2]
-        h[2:, 2:] += shift_prior
-        information[1:, 1:] = without(h, 2)
+        tilt, h, scale = _solve_robustly(jac, res, var, prior, iterations)
+        correction[1:] = tilt[:4]
+        h[4:, 4:] += shift_prior
+        information[1:, 1:] = without(h, 4)
+        of_body = np.concatenate((jac[:, :2], jac[:, 4:]), axis=1)
+        weak = prior[2:, 2:].copy()
+        weak[:2, :] = 0.0
+        weak[0, 0] = weak[1, 1] = 1.0 / LOOSE_RAD**2
+        out[4], out[5] = shared_by_sector(of_body, res + jac @ tilt, var, scale, sector, weak)
     left = np.linalg.inv(information[1:, 1:] + tilt_prior)
-    jac, res, var, out[3] = _ground_rows(planes, points, pose, z_m, correction[1:], kind, place, sigma_range_m)
+    jac, res, var, out[3] = _ground_rows(planes, points, pose, z_m, correction[1:3], kind, place, sigma_range_m)
     out[0] = len(res)
     if len(res) > 5:
         slope_prior = np.zeros((3, 3))

@@ -23,7 +23,9 @@ BEND_SIGMA_RAD = 0.0017  # slope that the ground's map may have gained while it 
 
 @dataclass(frozen=True, slots=True)
 class HeightFit:
-    """Errors of the guess: z, roll, pitch. information: (3, 3), of z by the ground, of roll and pitch by the walls."""
+    """Errors of the guess: z, roll, pitch, and of what the walls lean by. information: (5, 5), of z by the ground, of tilt
+    and lean by the walls. wall_variance: of the tilt by these walls, were their points independent; shared_ratio: how many
+    times that their bumps add."""
 
     correction: Array
     information: Array
@@ -31,6 +33,8 @@ class HeightFit:
     wall_points: int
     scale: float
     map_variance: float
+    wall_variance: float
+    shared_ratio: float
     new_ground: Array  # (N, 4) levelled block means to be put into the map when the scan is accepted
 
 
@@ -66,13 +70,15 @@ class HeightMap:
         sigma_range_m: float,
         gate_m: float,
         seen_spread_m: float,
+        lean: Array,
         tilt_information: Array,
         shift_information: Array,
     ) -> HeightFit:
         """Match (N, 3) levelled points of the lower layers at pose (x, y, yaw) and height z_m.
 
         gate_m: how far a point may be off the known ground. seen_spread_m: range of heights flown through so far.
-        tilt_information, shift_information: (2, 2) of roll and pitch, and of x and y, as they were used.
+        lean: (2,) rad about map x and y, of the walls. tilt_information, shift_information: (4, 4) of roll, pitch and
+        lean, (2, 2) of x and y, as they were used.
         """
         points_level, standing, kind, place = self._told_apart(points_level, pose, z_m, walls, gate_m, seen_spread_m)
         correction, information, out = hk.fit_height(
@@ -84,6 +90,7 @@ class HeightMap:
             kind,
             place,
             sigma_range_m,
+            lean,
             tilt_information,
             shift_information,
             BEND_SIGMA_RAD**2,
@@ -96,6 +103,8 @@ class HeightMap:
             wall_points=int(out[1]),
             scale=float(out[2]),
             map_variance=float(out[3]),
+            wall_variance=float(out[4]),
+            shared_ratio=float(out[5]),
             new_ground=points_level[kind == hk.GROUND],
         )
 
