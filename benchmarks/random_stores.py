@@ -39,9 +39,7 @@ def _any_mission(rng: np.random.Generator, number: int) -> dict[str, Any]:
     corners, size = _footprint(rng)
     height = float(rng.uniform(9, 17))
     flight = round(float(rng.uniform(5.5, min(10.0, height - 2.0))), 1)
-    middle = (
-        np.mean(np.array(corners), axis=0) if isinstance(corners, list) else np.array(corners["circle"]["center"])
-    )
+    middle = np.mean(np.array(corners), axis=0) if isinstance(corners, list) else np.array(corners["circle"]["center"])
     world: dict[str, Any] = {"footprint": corners, "height_m": round(height, 1)}
     if rng.random() < 0.3:
         world["floor_slope"] = [round(float(s), 4) for s in rng.uniform(-0.015, 0.015, 2)]
@@ -114,16 +112,18 @@ def _spot(rng: np.random.Generator, middle: np.ndarray, size: np.ndarray) -> lis
     return [round(float(v), 1) for v in middle + rng.uniform(-0.9, 0.9, 2) * size]
 
 
-def _pile(
-    rng: np.random.Generator, middle: np.ndarray, size: np.ndarray, flight: float, number: int
-) -> dict[str, Any]:
+def _pile(rng: np.random.Generator, middle: np.ndarray, size: np.ndarray, flight: float, number: int) -> dict[str, Any]:
     kind = str(rng.choice(["cone", "ridge", "gaussians"]))
     height = round(float(rng.uniform(1.5, flight - 1.3)), 1)
     leaning = bool(rng.random() < 0.35)
     pile: dict[str, Any] = {"kind": kind, "leaning": leaning}
     if kind == "gaussians":
         hills = [
-            {"center": _spot(rng, middle, size * 0.5), "height_m": height, "sigma_m": round(float(rng.uniform(2, 4)), 1)}
+            {
+                "center": _spot(rng, middle, size * 0.5),
+                "height_m": height,
+                "sigma_m": round(float(rng.uniform(2, 4)), 1),
+            }
             for _ in range(int(rng.integers(1, 4)))
         ]
         return {**pile, "hills": hills}

@@ -149,4 +149,3 @@ def _is_fit(estimate: OdometryEstimate) -> bool:
 def _about_z(yaw_rad: float) -> Array:
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-

@@ -66,7 +66,10 @@ def _carry(
 
 @kernel
 def _spread(p: Array, step_s: float, turned_rad: float) -> None:
-    """F P F' plus noise, in place, of a step in which it turned by so much. F is the unit matrix and: position from velocity, velocity from b, yaw from offset."""
+    """F P F' plus noise, in place, of a step that turned by so much.
+
+    F is the unit matrix and: position from velocity, velocity from b, yaw from offset.
+    """
     for k in range(N):
         for i in range(4):
             p[i, k] += step_s * p[i + 2, k]

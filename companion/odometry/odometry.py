@@ -289,9 +289,7 @@ class Odometry:
             self._track_noise(registration.scale)
             seen, apparent = registration.information, registration.apparent_information
             held = judgement.is_yaw_weak
-            planar = kalman.update(
-                planar, registration.pose, seen, apparent, prior, FLOOR_VARIANCE, holds_yaw=held
-            )
+            planar = kalman.update(planar, registration.pose, seen, apparent, prior, FLOOR_VARIANCE, holds_yaw=held)
             was_weak, self._is_weak = self._is_weak, False
             return planar, registration, judgement, was_weak and _is_jump(planar.x, guess)
         self._rejected_in_row += 1

@@ -41,7 +41,8 @@ class Registration:
     @property
     def per_yaw_m(self) -> Array:
         """(2,) by how much x and y change, in m, with each rad that yaw is off: in a round store, the way to its middle."""
-        return np.linalg.solve(self.apparent_information[:2, :2] + np.eye(2), -self.apparent_information[:2, 2])
+        of_place, with_yaw = self.apparent_information[:2, :2], self.apparent_information[:2, 2]
+        return np.asarray(np.linalg.solve(of_place + np.eye(2), -with_yaw), np.float64)
 
 
 class WallMap:

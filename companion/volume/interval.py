@@ -61,7 +61,8 @@ def error_budget(e: Evidence) -> dict[str, float]:
     return {
         "returns": _sampling(e, area),
         "position": flank * math.hypot(e.told_sigma_m / averaged, drift_m / math.sqrt(LEAST_ERRORS)),
-        "height": e.height_sigma_m * pile_area * SHARED_WITH_FLOOR / averaged,
+        # Heights drift with the tilt, which rough walls tell badly: a whole side shares it, however many keyframes it has.
+        "height": e.height_sigma_m * pile_area * SHARED_WITH_FLOOR / math.sqrt(LEAST_ERRORS),
         "range": e.range_offset_sigma_m * abs(_per_range(e, area, flanks)),
         "floor": _floor(e, area),
         "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _face(e),
