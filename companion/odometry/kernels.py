@@ -32,7 +32,7 @@ TUKEY = 4.685
 NORMAL_SIGMA_RAD = 0.02  # what the normal of a window errs by however many points it holds: curves, steps
 NEIGHBOURS = 4  # on each side of a point
 CORRELATED = 8.0  # points of one scan that share a line, and so its error
-NOISE_SLACK = 1.3  # of the spread across a line that noise may have: what is beyond is no straight wall, and not noise
+BENT = 0.05  # variance across over along, beyond the noise, above which a window holds no straight wall (a column: 0.1)
 # A surface seen from one height only may lean: material lies at 35 deg and its outline shrinks as the vehicle climbs.
 LEVEL_M = 0.05  # change of height that matters to none
 SHARED_LEAN = 8.0  # points that lean together
@@ -201,7 +201,7 @@ def residuals(
             + sigma_surface_m**2
             + lean_variance(line, z_m, cell_m)
             + CORRELATED * line[ACROSS] / line[WEIGHT] * (1.0 + off * off / line[ALONG])
-            + CORRELATED * max(line[ACROSS] - NOISE_SLACK * (sigma_range_m**2 + line[PX] + line[PY]), 0.0)
+            + CORRELATED * max(line[ACROSS] - sigma_range_m**2 - line[PX] - line[PY] - BENT * line[ALONG], 0.0)
         )
         rows[n, 0] = i
         rows[n, 1] = line[NX] * dx + line[NY] * dy
