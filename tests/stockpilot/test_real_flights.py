@@ -23,7 +23,7 @@ from tests.simbridge.sitl.real_binaries import BOTH, real_binary
 MISSION = Path(__file__).resolve().parents[2] / "missions" / "cement_store.yaml"
 ODOMETRY, SETPOINT, ORIGIN = 331, 84, 48
 # Nobody tells the autopilot that the companion is silent, and it comes down blind. PX4 begins after 1 s, is on the ground
-# after 13 s and disarms at 16 s, 0.9 to 2.7 m away (seven flights, the same seed): less than it had room to the nearest
+# after 13 s and disarms at 16 s, 0.9 to 2.7 m away (six flights, the same seed): less than it had room to the nearest
 # wall, and that is what it must be. ArduCopter misses the heartbeat at 2 to 3 s, pauses for 4 s more, is down at 16 s,
 # 5 m away; with FS_GCS_ENABLE 0 it began at 12 s, and at 19 s, 7.8 m away, was in the pile.
 SILENT_DOWN_WITHIN_S = 22.0
