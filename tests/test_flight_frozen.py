@@ -59,5 +59,6 @@ def test_a_companion_that_wakes_after_the_autopilot_began_to_land_leaves_it_the_
     outcome = run.run()
     assert (outcome.state, simulation.collision) == ("taken_over", False), outcome.reason
     assert "failsafe" in outcome.reason
+    # A real PX4, frozen as long in the same way, came down 0.8 m away: it flies on for 1 s, and vision is back before it is blind.
     assert np.linalg.norm((simulation.truth().position_world_m - at)[:2]) < 2.0
     assert np.linalg.norm(simulation.truth().velocity_world_mps) < 0.2

@@ -169,7 +169,16 @@ ARDUPILOT_MANIFEST = Manifest(
         Expected(name="FS_EKF_THRESH", low=0.5, high=1.0, mend=0.8, why="0 switches that failsafe off"),
         Expected(name="FS_GCS_ENABLE", allowed=(0, 5), mend=0, must=True,
                  why="ground station lost: 1 to 4 and 6 begin with a return, a climb under a roof"),
-        Expected(name="GUID_TIMEOUT", low=0.5, high=3.0, mend=3.0, why="seconds without setpoints until it stops"),
+        Expected(name="FS_GCS_ENABLE", allowed=(5,), mend=5,
+                 why="a companion that hangs, or a cable that breaks: land (5) after FS_GCS_TIMEOUT; else blind for 8 s, and "
+                     "then 4 s more before it descends, it drifts into a wall (measured)"),
+        Expected(name="MAV_GCS_SYSID", low=1, high=250, mend=1, other_names=("SYSID_MYGCS",),
+                 why="whose heartbeat FS_GCS_ENABLE watches: the companion's, by the vehicle's own system id; 255 (the "
+                     "default) is a ground station, which may be none or go on while the companion hangs"),
+        Expected(name="FS_GCS_TIMEOUT", low=2.0, high=3.0, mend=2.0,
+                 why="seconds without that heartbeat, which comes once a second: more is more drift"),
+        Expected(name="GUID_TIMEOUT", low=0.5, high=1.5, mend=1.0,
+                 why="seconds without setpoints until it stops: until then it flies on, 0.4 m in each at 0.43 m/s"),
         Expected(name="RTL_ALT", high=1000, mend=500, other_names=("RTL_ALT_M",),
                  why="centimetres that a return climbs to, under a roof"),
         Expected(name="LAND_ALT_LOW", high=500, mend=300, other_names=("LAND_ALT_LOW_M",),

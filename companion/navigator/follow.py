@@ -1,5 +1,5 @@
 """Whether the vehicle does what it is told. An autopilot that no longer gets our setpoints may say nothing: ArduCopter
-stops after 3 s and holds in GUIDED (ARDUPILOT.md). Only what it does tells: so what was asked is compared with what was
+stops after GUID_TIMEOUT and holds in GUIDED (ARDUPILOT.md). Only what it does tells: so what was asked is compared with what was
 done.
 
 Gusts carry a vehicle that follows off its way too. They do not carry it ever farther, as it flies against them: so where

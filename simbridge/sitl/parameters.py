@@ -52,10 +52,13 @@ ARDUPILOT_VISION: Parameters = {
     "COMPASS_USE2": 0,
     "COMPASS_USE3": 0,
     "FS_THR_ENABLE": 0,  # no transmitter
-    "FS_GCS_ENABLE": 0,
     "DISARM_DELAY": 0,
 }
 ARDUPILOT_HALL: Parameters = {
+    "FS_GCS_ENABLE": 5,  # the companion's heartbeat lost: land
+    "FS_GCS_TIMEOUT": 2,  # seconds
+    "MAV_GCS_SYSID": 1,  # whose heartbeat: the vehicle's own system, which the companion is of
+    "GUID_TIMEOUT": 1,  # seconds that the last setpoint is flown on, as PX4's COM_OF_LOSS_T
     "RTL_ALT": 500,  # centimetres
     "LAND_ALT_LOW": 300,  # centimetres, above which it comes down at 1.5 m/s: blind, each second is drift
 }

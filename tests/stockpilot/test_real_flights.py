@@ -22,6 +22,12 @@ from tests.simbridge.sitl.real_binaries import BOTH, real_binary
 
 MISSION = Path(__file__).resolve().parents[2] / "missions" / "cement_store.yaml"
 ODOMETRY, SETPOINT, ORIGIN = 331, 84, 48
+# Nobody tells the autopilot that the companion is silent, and it comes down blind. PX4 begins after 1 s, is on the ground
+# after 13 s and disarms at 16 s, 0.9 to 2.7 m away (six flights, the same seed): less than it had room to the nearest
+# wall, and that is what it must be. ArduCopter misses the heartbeat at 2 to 3 s, pauses for 4 s more, is down at 16 s,
+# 5 m away; with FS_GCS_ENABLE 0 it began at 12 s, and at 19 s, 7.8 m away, was in the pile.
+SILENT_DOWN_WITHIN_S = 22.0
+ARDUPILOT_DRIFT_M = 7.0
 pytestmark = pytest.mark.timeout(1800)
 
 
@@ -148,8 +154,8 @@ def test_an_autopilot_restarted_on_the_ground_is_set_up_again_and_flies(kind: st
 
 @pytest.mark.parametrize("kind", BOTH)
 def test_setpoints_lost_in_flight_end_on_the_ground(kind: str) -> None:
-    """PX4 lands by itself after 1.0 to 1.5 s; ArduPilot stands still after 3 s and says nothing: the companion sees that
-    it does not follow, and lands it."""
+    """PX4 lands by itself after 1.0 to 1.5 s; ArduPilot stands still after 1 s and says nothing, for the companion's
+    heartbeat goes on: the companion sees that it does not follow, and lands it."""
     prepared, run, wire = runner(kind)
     with prepared.closing:
         fly_until(run, 30.0)
@@ -158,7 +164,7 @@ def test_setpoints_lost_in_flight_end_on_the_ground(kind: str) -> None:
             assert seconds_until(run, FlightMode.LAND, 5.0) < 2.6
             land(run, 60.0)
         else:
-            assert 3.0 < seconds_until(run, FlightMode.LAND, 15.0) < 12.0
+            assert 1.0 < seconds_until(run, FlightMode.LAND, 15.0) < 12.0
             assert "not_followed" in [event.name for event in prepared.flight.events]
             land(run, 60.0)
 
@@ -169,7 +175,7 @@ def test_companion_killed_in_flight_ends_on_the_ground(kind: str) -> None:
     with prepared.closing:
         fly_until(run, 30.0)
         wire.is_companion_dead = True
-        land(run, 90.0, drifts=kind == "ardupilot")
+        land(run, SILENT_DOWN_WITHIN_S)
 
 
 @pytest.mark.parametrize("kind", BOTH)
@@ -179,12 +185,11 @@ def test_companion_frozen_in_flight_ends_on_the_ground_and_awake_again_leaves_it
     with prepared.closing:
         fly_until(run, 30.0)
         frozen_at = run.simulation.truth().position_world_m.copy()
-        freeze(run, lambda: run.simulation.collision or motors_stand(run), limit_s=120.0)
-        landed_at = run.simulation.truth().position_world_m.copy()
-        if run.simulation.collision:  # blind for more than 8 s, as when the companion is killed
-            assert kind == "ardupilot"
-            return
-        assert np.linalg.norm((landed_at - frozen_at)[:2]) < (2.0 if kind == "px4" else 12.0)
+        room_m = run.simulation.min_clearance_m
+        freeze(run, lambda: run.simulation.collision or motors_stand(run), limit_s=SILENT_DOWN_WITHIN_S)
+        drift_m = np.linalg.norm((run.simulation.truth().position_world_m - frozen_at)[:2])
+        assert not run.simulation.collision
+        assert drift_m < (room_m if kind == "px4" else ARDUPILOT_DRIFT_M)
         awake_ns = run.simulation.t_ns
         while run.simulation.t_ns < awake_ns + 10e9:
             run.step()
@@ -194,17 +199,16 @@ def test_companion_frozen_in_flight_ends_on_the_ground_and_awake_again_leaves_it
 
 @pytest.mark.parametrize("kind", BOTH)
 def test_companion_frozen_for_3_s_in_flight_ends_on_the_ground(kind: str) -> None:
-    """PX4 has begun to land when it wakes: it leaves it the vehicle. ArduPilot has noticed nothing yet; the companion has."""
+    """The autopilot has begun to land when it wakes, PX4 for want of setpoints, ArduPilot of its heartbeat: it leaves it
+    the vehicle."""
     prepared, run, _ = runner(kind)
     with prepared.closing:
         fly_until(run, 30.0)
         wakes_ns = run.simulation.t_ns + 3_000_000_000
         freeze(run, lambda: run.simulation.t_ns >= wakes_ns, limit_s=5.0)
-        if kind == "px4":
-            seconds_until(run, FlightMode.LAND, 2.0)
-        land(run, 400.0, drifts=kind == "ardupilot")
-        if kind == "px4":
-            assert "taken_over" in [event.name for event in prepared.flight.events]
+        seconds_until(run, FlightMode.LAND, 2.0)
+        land(run, 60.0)
+        assert "taken_over" in [event.name for event in prepared.flight.events]
 
 
 def motors_stand(run: Lockstep) -> bool:

@@ -127,3 +127,25 @@ def test_ardupilot_as_it_flew_without_gps_is_green() -> None:
     checks = check_parameters(Facts(autopilot="ardupilot", parameters=recorded("ardupilot")))
     assert len(checks) > 12
     assert [c.name for c in checks if c.verdict is Verdict.FAIL] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "wrong", "verdict"),
+    [
+        ("FS_GCS_ENABLE", 5, 0, Verdict.WARN),
+        ("FS_GCS_ENABLE", 5, 2, Verdict.FAIL),
+        ("MAV_GCS_SYSID", 1, 255, Verdict.WARN),
+        ("SYSID_MYGCS", 1, 255, Verdict.WARN),
+        ("FS_GCS_TIMEOUT", 2, 5, Verdict.WARN),
+        ("GUID_TIMEOUT", 1, 3, Verdict.WARN),
+    ],
+)
+def test_an_arducopter_that_would_not_miss_the_companion_is_told(
+    name: str, right: float, wrong: float, verdict: Verdict
+) -> None:
+    """As it comes out of the box it flies on for 3 s and then drifts, blind from 7 s on, until it lands."""
+    (good,) = check_parameters(Facts(autopilot="ardupilot", parameters={name: right}))
+    (bad,) = check_parameters(Facts(autopilot="ardupilot", parameters={name: wrong}))
+    assert (good.verdict, bad.verdict) == (Verdict.OK, verdict)
+    assert bad.why
+    assert bad.mend

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from companion.config import MavlinkConfig
 from companion.mavlink.manifest import MANIFESTS
 from simbridge.config import VehicleConfig
 from simbridge.sitl import parameters
@@ -56,3 +57,10 @@ def test_px4_never_climbs_home_under_a_roof() -> None:
     origin is set: a climb under a roof"."""
     assert parameters.PX4["COM_OBL_RC_ACT"] == 4
     assert parameters.PX4["NAV_RCL_ACT"] == 3
+
+
+def test_arducopter_lands_when_the_companion_falls_silent() -> None:
+    """It watches the heartbeat of one system: the vehicle's own is the companion's."""
+    ours = parameters.ARDUPILOT
+    assert (ours["FS_GCS_ENABLE"], ours["MAV_GCS_SYSID"]) == (5, MavlinkConfig().system_id)
+    assert 2 <= ours["FS_GCS_TIMEOUT"] <= 3  # the heartbeat comes once a second

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from simbridge.sensors import BaroSample, ImuSample, isa_pressure_hpa
 from simbridge.sitl import parameters
 from simbridge.sitl.ardupilot import ArduPilotSitl
+from simbridge.sitl.ports import arducopter_ports, first_free_instance
 from simbridge.sitl.process import start_arducopter, start_px4
 from simbridge.sitl.px4 import Px4Sitl
 from tests.simbridge.sitl.real_binaries import real_binary
@@ -85,7 +86,8 @@ def test_real_arducopter_keeps_lockstep_at_800_hz_and_its_clock_is_ours() -> Non
         link.bind(("127.0.0.1", 0))
         link.setblocking(False)
         ports = {"physics_port": sitl.port, "offboard_port": link.getsockname()[1], "ground_port": 14550}
-        with start_arducopter(binary, parameters.ARDUPILOT, **ports) as copter:
+        instance = first_free_instance(arducopter_ports)  # its third serial port is bound whatever we give
+        with start_arducopter(binary, parameters.ARDUPILOT, instance=instance, **ports) as copter:
             sitl.process = copter
             for _ in range(8000):
                 motors = sitl.step(t_ns, sensors(rng), None, 0.12)
