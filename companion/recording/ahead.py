@@ -129,7 +129,7 @@ def registering(flight: Flight, inputs: Sequence[Input]) -> Iterator[ScansAhead]
         yield ScansAhead(flight, _received(ours))
     finally:
         ours.close()
-        process.terminate()
+        process.kill()  # it leaves nothing behind, and may have the handler of SIGTERM of the program that it is a copy of
         process.join()
 
 

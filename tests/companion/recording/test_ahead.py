@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import os
+import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -67,6 +69,20 @@ def test_a_process_that_ends_early_is_told_and_not_taken_for_the_end(monkeypatch
     replay = Replay(flight)
     with ahead.registering(flight, inputs) as replay.scans, pytest.raises(RuntimeError, match="ended early"):
         replay.run(inputs)
+
+
+def test_a_process_that_does_not_mind_sigterm_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is a copy of a program that may have a handler of its own; it was waited for without an end."""
+    flight, inputs = recorded()
+    monkeypatch.setattr(ahead, "register", lambda *_: [time.sleep(1.0) for _ in range(60)])
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    try:
+        began = time.monotonic()
+        with ahead.registering(flight, inputs):
+            time.sleep(0.2)
+        assert time.monotonic() - began < 30.0
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_attitude_that_differs_between_the_two_is_an_error() -> None:
