@@ -16,9 +16,8 @@ MAX_RAD = math.radians(4.0)
 ELSEWHERE_M = 10.0  # way after which other bumps are in sight
 SHARED_MEMORY = 0.98  # of what is known of the bumps, from scan to scan
 SHARED_POINTS = 500  # on walls, that have to speak of bumps before they are believed in
-LONG_BUMPS = (
-    4.0  # variance of the tilt over what sectors tell: bumps longer than a sector is wide, and what the fit hides
-)
+# variance of the tilt over what sectors tell: bumps longer than a sector is wide, and what the fit hides
+LONG_BUMPS = 4.0
 
 
 class Tilt:
@@ -34,10 +33,8 @@ class Tilt:
         self.p = np.diag([SIGMA_RAD**2, SIGMA_RAD**2, FLOOR_RAD**2, FLOOR_RAD**2])
         self._place = np.zeros(3)
         self._way_m, self._way_variance = 0.0, 0.0  # over ground; sum of the tilt's variance over it
-        self._shared, self._points = (
-            0.0,
-            0.0,
-        )  # how many times the variance of independent points the bumps add, by points
+        # how many times the variance of independent points the bumps add, by points
+        self._shared, self._points = 0.0, 0.0
         self._at_last = 0.0  # variance of the tilt by the walls last seen, were their points independent
         self._alone = 0.0  # the same of the walls that the lean is believed of
 

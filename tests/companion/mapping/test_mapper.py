@@ -182,6 +182,26 @@ def test_memory_is_bounded_and_the_map_still_measures() -> None:
     assert abs(estimate_volume(point_map, CFG.volume).volume_m3) < 2.0
 
 
+def test_a_full_map_is_thinned_evenly() -> None:
+    """All scans keep the same share of their returns, first and last, near and far: nothing seen weighs more than before."""
+    full, thin = Mapper(CFG), Mapper(CFG, max_points=40_000)
+    for step in range(60):
+        for mapper in (full, thin):
+            mapper.add(room_scan(noise_m=0.12, seed=step), estimate(x=0.05 * step, keyframe=step // 10))
+    all_points, kept = full.point_map(), thin.point_map()
+    share = mapper.size / full.size
+    assert share < 0.3
+    each = np.bincount(kept.scan_index, minlength=60) / np.bincount(all_points.scan_index, minlength=60)
+    assert np.all(np.abs(each / share - 1.0) < 0.1)
+    for low, high in (
+        (-0.5, -0.12),
+        (-0.12, 0.12),
+        (0.12, 0.5),
+    ):  # below, on and above the floor: the noise keeps its shape
+        of_all, of_kept = (np.sum((m.points_map[:, 2] > low) & (m.points_map[:, 2] < high)) for m in (all_points, kept))
+        assert of_kept / of_all == pytest.approx(share, rel=0.1)
+
+
 def test_map_tells_the_typical_sigma_of_its_poses() -> None:
     mapper = Mapper(CFG)
     mapper.add(room_scan(), estimate())
