@@ -60,11 +60,11 @@ def weak_direction(information: Array) -> tuple[float, Array]:
 
 
 def is_yaw_weak(information: Array) -> bool:
-    """True when the walls alone leave yaw to more than 1 deg (round silo: turning changes nothing)."""
+    """True when the walls alone leave yaw to more than 2 deg (round silo: turning changes nothing)."""
     (a, b, u), (_, c, v), (_, _, yaw) = information.tolist()
     a, c = a + 1e-6, c + 1e-6
     left = yaw - (c * u * u - 2.0 * b * u * v + a * v * v) / (a * c - b * b)  # translation left free
-    return bool(left < 1.0 / math.radians(1.0) ** 2)
+    return bool(left < 1.0 / math.radians(2.0) ** 2)
 
 
 def _refusal(registration: Registration, guess: Array, guess_covariance: Array, points: int) -> str:
