@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.messages import Array
+from companion.odometry import kernels
 from companion.odometry.wall_map import Registration
 
 # Of the translation's information; a hall has about 0.2, a corridor 0.004 (measured). With 0.01 a hall of 120 m with pilasters,
 # its ends out of range, was flown along by chance, and into its wall.
 MIN_EIGENVALUE_RATIO = 0.02
+WEAK_YAW_INFORMATION = 1.0 / math.radians(2.0) ** 2  # 1/rad2
 MIN_INLIERS = 40
 MIN_INLIER_RATIO = 0.3  # of the layer's points; a door that opens on a new hall leaves that many
 MAX_SCALE = 2.8
@@ -61,10 +63,7 @@ def weak_direction(information: Array) -> tuple[float, Array]:
 
 def is_yaw_weak(information: Array) -> bool:
     """True when the walls alone leave yaw to more than 2 deg (round silo: turning changes nothing)."""
-    (a, b, u), (_, c, v), (_, _, yaw) = information.tolist()
-    a, c = a + 1e-6, c + 1e-6
-    left = yaw - (c * u * u - 2.0 * b * u * v + a * v * v) / (a * c - b * b)  # translation left free
-    return bool(left < 1.0 / math.radians(2.0) ** 2)
+    return bool(kernels.without_translation(information) < WEAK_YAW_INFORMATION)
 
 
 def _refusal(registration: Registration, guess: Array, guess_covariance: Array, points: int) -> str:

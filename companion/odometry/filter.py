@@ -124,12 +124,11 @@ def update(
 ) -> Planar:
     """Fuse a registration that was found with a prior about the state's own pose.
 
-    holds_yaw: leave yaw to the gyro as it is, and take x and y as seen from that yaw. (Where little tells of
-    yaw, what many scans seem to tell of it is the error of their normals, adding up.)
-
     pose: (3,) where points and prior agree. information: (3, 3) of the points alone, may be singular.
     apparent: (3, 3) the information that the registration itself went by.
     floor_variance: (3,) what a registration errs by however many points agree (the walls' own errors).
+    holds_yaw: leave yaw to the gyro as it is, and take x and y as seen from that yaw. (Where little tells of yaw, what many
+    scans seem to tell of it is the error of their normals, adding up.)
     """
     x, p = _update(
         state.x, state.p, pose, np.ascontiguousarray(information), np.ascontiguousarray(apparent), prior_information,
@@ -153,6 +152,7 @@ def _update(
     off = np.array([pose[0] - x[0], pose[1] - x[1], pose[2] - x[6]])
     shift = (apparent + prior) @ off  # = apparent (ML pose - state's pose)
     gradient = information @ np.linalg.solve(apparent + 1e-3 * np.eye(3), shift)
+    x = x.copy()
     if holds_yaw:
         information = np.zeros((3, 3))
         information[:2, :2] = apparent[:2, :2]
@@ -160,7 +160,6 @@ def _update(
         p = p.copy()
         p[:YAW, YAW:] = 0.0
         p[YAW:, :YAW] = 0.0
-        x = x.copy()
         x[YAW + 1] = 0.0  # the flight controller has taken it out, by the yaw that we told it: twice would run away
     discount = np.linalg.inv(np.eye(3) + information * floor_variance)
     information = discount @ information
@@ -172,7 +171,6 @@ def _update(
     p = np.linalg.inv(total)
     p = 0.5 * (p + p.T)
     pull = discount @ gradient
-    x = x.copy()
     for i in range(N):
         x[i] += p[i, 0] * pull[0] + p[i, 1] * pull[1] + p[i, 6] * pull[2]
     return x, p

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from companion.jit import kernel
 from companion.messages import Array
-from companion.odometry.jackknife import SECTORS, TUKEY, shared_by_sector
+from companion.odometry.jackknife import SECTORS, shared_by_sector
+from companion.odometry.kernels import TUKEY
 
 WINDOW = 1
 W, X, Y, Z, XX, XY, YY, XZ, YZ, ZZ, VZ = range(11)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from companion.jit import kernel
 from companion.messages import Array
+from companion.odometry.kernels import TUKEY
 
 SECTORS = 24  # of the turn: what points of one err by together is what a wall's bumps do
-TUKEY = 4.685
 
 
 @kernel

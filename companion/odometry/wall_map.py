@@ -16,7 +16,7 @@ from companion.odometry.grid_growth import growth
 
 # 1/rad2: information about yaw, x and y left free, below which it is doubted: a hall's walls give twenty times as much; so
 # little comes from a few things in a round store that are no straight walls, and errs alike from scan to scan.
-WEAK_YAW = 1.0 / math.radians(0.1) ** 2
+DOUBTED_YAW = 1.0 / math.radians(0.1) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ class WallMap:
         believed = information.copy()
         believed[2, 2] -= out[9]
         of_yaw = kernels.without_translation(believed)
-        believed[2, 2] -= of_yaw * WEAK_YAW / (of_yaw + WEAK_YAW)
+        believed[2, 2] -= of_yaw * DOUBTED_YAW / (of_yaw + DOUBTED_YAW)
         return Registration(
             pose=pose,
             information=believed,
