@@ -74,7 +74,7 @@ def test_run_gives_px4_an_instance_none_of_whose_ports_another_program_holds(
         with closing:
             taken = wire._link.port - COMPANION_PORT
             arguments = started_with(tmp_path)
-    assert taken > instance
+    assert taken != instance  # a lower one may have become free since
     assert arguments[arguments.index("-i") + 1] == str(taken)
 
 
@@ -96,7 +96,7 @@ def test_arducopter_gets_an_instance_whose_ports_are_free(world: SimConfig, stan
         with closing:
             arguments = started_with(tmp_path)
     taken = int(arguments[arguments.index("--instance") + 1])
-    assert taken > instance
+    assert taken != instance
     assert arguments[arguments.index("--sim-port-out") + 1] == str(9002 + 10 * taken)
 
 
