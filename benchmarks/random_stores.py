@@ -17,6 +17,7 @@ import numpy as np
 import yaml
 
 from companion.errors import ConfigError
+from simbridge.loop import start_pose
 from stockpilot.mission import build_mission
 
 MOST_TRIES = 400
@@ -28,8 +29,10 @@ def draw(number: int) -> dict[str, Any]:
     for _ in range(MOST_TRIES):
         raw = _any_mission(rng, number)
         try:
-            build_mission(raw, source="drawn")
-        except ConfigError:
+            sim = build_mission(raw, source="drawn").sim
+            if sim is not None:
+                start_pose(sim)
+        except (ConfigError, ValueError):  # not allowed; no place to stand
             continue
         return raw
     raise RuntimeError(f"number {number}: no allowed mission in {MOST_TRIES} draws")

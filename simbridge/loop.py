@@ -30,6 +30,8 @@ BOOT_NS = 1_000_000_000
 CLEARANCE_PERIOD_NS = 40_000_000
 CLEARANCE_SLACK_M = 0.5  # by which clearance from a pile may fall short at once: it is told from its corners
 HARD_LANDING_MPS = 1.5  # PX4 lands at 0.7
+FLANK_SLOPE = math.tan(math.radians(15.0))  # from here on what lies below is a flank, to be flown into
+FLANK_MPS = 0.25  # sideways; one that lands there, and slides, is slower
 LIFTOFF_M = 0.3
 TOPPLED_COS = math.cos(math.radians(50.0))
 
@@ -88,11 +90,11 @@ class Simulation:
         """4 ms: what the sensors measured goes to the flight controller, its motor commands move the vehicle."""
         vehicle = self._vehicle
         self._before[:] = vehicle.pose
-        falling_mps = -float(vehicle.motion[2])
+        before_mps: tuple[float, float, float] = tuple(vehicle.motion[:3].tolist())
         for _ in range(self._commands):
             self._command()
         self._turn_lidar()
-        self._watch(falling_mps)
+        self._watch(before_mps)
 
     def _command(self) -> None:
         t_ns, vehicle, faults = self.t_ns, self._vehicle, self._faults
@@ -142,8 +144,8 @@ class Simulation:
         packets = self._lidar.cast(t_ns - self._step_ns // 2, t_ns, self._before, vehicle.pose, vehicle.motion)
         self._packets += self._faults.lidar(packets, t_ns)
 
-    def _watch(self, falling_mps: float) -> None:
-        """Lift-off, collision and clearance. falling_mps: before the step."""
+    def _watch(self, before_mps: tuple[float, float, float]) -> None:
+        """Lift-off, collision and clearance. before_mps: the velocity in `world` before the step."""
         vehicle = self._vehicle
         if self._faults.liftoff_ns is None and float(vehicle.position[2]) > self._ground_z + LIFTOFF_M:
             self._faults.liftoff_ns = self.t_ns
@@ -151,10 +153,10 @@ class Simulation:
             self._note_clearance()
         if self.collision or not vehicle.has_contact:
             return
-        if vehicle.touches_store:
-            self.collision = True
-        elif falling_mps > HARD_LANDING_MPS or vehicle.up_cos < TOPPLED_COS:
-            self.collision = True  # on the ground, but not as one lands
+        vx, vy, vz = before_mps
+        is_into_flank = vehicle.ground_slope > FLANK_SLOPE and math.hypot(vx, vy) > FLANK_MPS
+        is_landing = -vz <= HARD_LANDING_MPS and vehicle.up_cos >= TOPPLED_COS and not is_into_flank
+        self.collision = vehicle.touches_store or not is_landing
 
     def _note_clearance(self) -> None:
         """Computed only where it can be the smallest yet: it changes no faster than the vehicle moves."""

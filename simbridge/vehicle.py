@@ -95,6 +95,12 @@ class Vehicle:
         return any(self._ground_geom not in pair for pair in self.data.contact.geom.tolist())
 
     @property
+    def ground_slope(self) -> float:
+        """Rise per metre of what lies below: floor or pile."""
+        _, slope_x, slope_y = self._surface.plane(*self.position[:2].tolist())
+        return math.hypot(slope_x, slope_y)
+
+    @property
     def up_cos(self) -> float:
         """Cosine of the tilt."""
         _, x, y, _ = self.q_world_body_wxyz.tolist()

@@ -167,7 +167,7 @@ ARDUPILOT_MANIFEST = Manifest(
         Expected(name="FS_EKF_ACTION", allowed=(1, 3), mend=1, must=True,
                  why="vision lost: land (1); 2 (AltHold) waits for a pilot's stick"),
         Expected(name="FS_EKF_THRESH", low=0.5, high=1.0, mend=0.8, why="0 switches that failsafe off"),
-        Expected(name="FS_GCS_ENABLE", allowed=(0, 5), mend=0, must=True,
+        Expected(name="FS_GCS_ENABLE", allowed=(0, 5), mend=5, must=True,
                  why="ground station lost: 1 to 4 and 6 begin with a return, a climb under a roof"),
         Expected(name="FS_GCS_ENABLE", allowed=(5,), mend=5,
                  why="a companion that hangs, or a cable that breaks: land (5) after FS_GCS_TIMEOUT; else blind for 8 s, and "

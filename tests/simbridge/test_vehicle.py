@@ -166,6 +166,17 @@ def test_only_a_hard_landing_is_a_collision(speed: float, is_collision: bool) ->
     assert simulation.collision is is_collision
 
 
+@pytest.mark.parametrize(("speed", "is_collision"), [(0.43, True), (0.0, False)], ids=["flown into", "landed on"])
+def test_flying_into_a_piles_flank_is_a_collision_and_landing_there_is_not(speed: float, is_collision: bool) -> None:
+    simulation, motors = hovering(world={"piles": [CONE]})
+    simulation._vehicle.position[:] = 11.0, 6.0, simulation.world.surface_height(11.0, 6.0) + 0.3
+    simulation._vehicle.motion[:3] = speed, 0.0, 0.0
+    motors.command = np.full(4, 0.5)
+    run(simulation, 0.6)
+    assert simulation._vehicle.has_contact
+    assert simulation.collision is is_collision
+
+
 def test_lying_on_its_back_is_a_collision() -> None:
     simulation = Simulation(sim_config(), Motors())
     simulation._vehicle.position[2] = 0.3
