@@ -17,10 +17,13 @@ import numpy as np
 import yaml
 
 from companion.errors import ConfigError
+from simbridge.config import SimConfig
 from simbridge.loop import start_pose
+from simbridge.world import build_world
 from stockpilot.mission import build_mission
 
 MOST_TRIES = 400
+LEAST_SEEN_M = 0.3  # of a box, above the pile that it stands in
 
 
 def draw(number: int) -> dict[str, Any]:
@@ -30,12 +33,19 @@ def draw(number: int) -> dict[str, Any]:
         raw = _any_mission(rng, number)
         try:
             sim = build_mission(raw, source="drawn").sim
-            if sim is not None:
-                start_pose(sim)
+            assert sim is not None
+            start_pose(sim)
         except (ConfigError, ValueError):  # not allowed; no place to stand
             continue
-        return raw
+        if not _hides_a_box(sim):
+            return raw
     raise RuntimeError(f"number {number}: no allowed mission in {MOST_TRIES} draws")
+
+
+def _hides_a_box(sim: SimConfig) -> bool:
+    """A pile that covers a box holds less than it shows, and nothing that flies can tell."""
+    world = build_world(sim.world)
+    return any(world.surface_height(*box.center) > box.size_m[2] - LEAST_SEEN_M for box in sim.world.boxes)
 
 
 def _any_mission(rng: np.random.Generator, number: int) -> dict[str, Any]:

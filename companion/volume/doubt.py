@@ -46,16 +46,16 @@ def doubt(
     point_map: PointMap,
     volume_m3: float,
     unseen: float,
-    steep_m3: float,
+    doubtful_m3: float,
 ) -> Doubt:
     """All signs at once: their warnings, and what they add to the interval.
 
-    unseen: share of the floor. steep_m3: volume under upright faces that may be an object's.
+    unseen: share of the floor. doubtful_m3: counted as material, and may be objects.
     """
     area = e.grid.cell_area_m2 * e.share
     pile_area, total = float(area[e.pile].sum()), float(area.sum())
     said: list[str] = list(footprint.warnings)
-    extra: list[float] = [steep_m3]
+    extra: list[float] = [doubtful_m3]
     if not footprint.has_walls:
         said.append("no closed walls were found: the volume is of the map's own extent, its edge cut where returns end")
         if len(point_map.path_map):

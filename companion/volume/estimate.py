@@ -16,12 +16,14 @@ from companion.volume.floor import Floor, fit_floor, level_floor
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc, grid_around
 from companion.volume.interval import Evidence, error_budget, interval
 from companion.volume.objects import find_objects
+from companion.volume.shadow import Shadow, lay_hidden
 from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells, without_strays
 from companion.volume.walls import Footprint, find_footprint
 
 MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
 
+RIM_M = 1.5  # of floor, around the material
 LEAST_KEYFRAMES = 6  # that see the floor, before their disagreement on it is judged
 LEAST_FROM_ABOVE = 0.3  # of the map's points
 BESIDE_WALLS_M = 1.0  # beyond the strip
@@ -74,7 +76,8 @@ def estimate_volume(
         grid, cells, footprint.share > 0, strip, reach_m=INTERPOLATION_REACH_M, strip_width_m=footprint.margin_m
     )
     surface, contact = _meet_walls(points, grid, np.where(low, key, -1), footprint, floor, surface)
-    report = _report(point_map, cfg, grid, footprint, cells, floor, surface, contact)
+    shadow = lay_hidden(point_map, grid, surface, floor.z(*grid.centres()), footprint.noise_m)
+    report = _report(point_map, cfg, grid, footprint, cells, floor, shadow, contact)
     return _at_least(report) if is_cut_short and not footprint.has_walls else report
 
 
@@ -103,15 +106,18 @@ def _report(
     footprint: Footprint,
     cells: Cells,
     floor: Floor,
-    surface: Surface,
+    shadow: Shadow,
     contact: Contact,
 ) -> VolumeReport:
+    surface = shadow.surface
     x, y = grid.centres()
     floor_z = np.where(footprint.share > 0, floor.z(x, y), np.nan)
     height = np.nan_to_num(surface.z_m - floor_z)
     inside = footprint.share > 0
     trusted = inside & (footprint.depth_m > footprint.margin_m + 2 * grid.cell_m) & ~footprint.blocked
+    trusted &= ~ndimage.binary_dilation(shadow.sigma_m > 0)
     objects = find_objects(grid, height, inside, trusted)
+    height = objects.height_m
     footprint = replace(
         footprint,
         share=np.where(objects.cells, 0.0, footprint.share),
@@ -127,6 +133,7 @@ def _report(
         grid=grid,
         cells=cells,
         surface=surface,
+        hidden_sigma_m=shadow.sigma_m,
         contact=contact,
         floor=floor,
         height_m=height,
@@ -144,8 +151,7 @@ def _report(
     )
     total = float(area.sum())
     ratio = {s: float(area[surface.state == s].sum()) / total for s in CellState}
-    steep_m3 = float(np.sum((np.maximum(height, 0.0) * area)[objects.steep & pile]))
-    doubts = doubt(evidence, footprint, cells, floor, point_map, volume, ratio[CellState.UNSEEN], steep_m3)
+    doubts = doubt(evidence, footprint, cells, floor, point_map, volume, ratio[CellState.UNSEEN], objects.doubtful_m3)
     budget = error_budget(evidence) | {"doubt": doubts.sigma_m3}
     return VolumeReport(
         volume_m3=volume,
@@ -180,7 +186,7 @@ def _seen_from_above(point_map: PointMap) -> PointMap:
 def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
     """Where material lies, with a rim of floor all around it.
 
-    The rim (1 m) makes the choice free of bias: heights are summed with their sign, and a foot too thin to be told
+    The rim (RIM_M) makes the choice free of bias: heights are summed with their sign, and a foot too thin to be told
     from noise is within the rim.
     """
     size = 2 * cells_of(0.25, grid) + 1
@@ -194,7 +200,7 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
         area = np.bincount(label.ravel()) * grid.cell_area_m2
         area[0] = 0.0
         core = area[label] >= 1.0
-    return np.asarray(ndimage.binary_dilation(core, disc(cells_of(1.0, grid))) & inside)
+    return np.asarray(ndimage.binary_dilation(core, disc(cells_of(RIM_M, grid))) & inside)
 
 
 def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> float | None:

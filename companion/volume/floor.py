@@ -13,6 +13,8 @@ from companion.volume.grid import Grid, Index, Mask, cells_of, disc
 MAX_SLOPE = 0.12  # steeper than any floor that trucks drive on; loose material at rest is far steeper
 TRIALS = 500
 LEAST_CELLS = 50  # of bare floor, away from all that rises
+SURE_SHARE = 0.1  # of all cells, on one plane
+BENT_M = 0.1  # what a floor departs from its plane by, where the attitude that mapped it was off
 BLOCK_M = 3.0  # floors undulate over a few metres: residuals are judged in blocks of this size
 
 
@@ -54,22 +56,30 @@ def fit_floor(grid: Grid, x: Array, y: Array, z: Array, sigma: Array, usable: Ma
             found=False,
         )
     px, py, pz = (v.ravel()[index] for v in (x, y, z))
-    tolerance = float(np.clip(3.0 * np.median(sigma.ravel()[index]), 0.04, 0.25))
     design = np.column_stack([np.ones(len(index)), px - centre[0], py - centre[1]])
-    plane = _lowest_plane(design, pz, tolerance)
-    cells = nothing
-    for _ in range(6):
-        cells = _floor_cells(grid, index, design, pz, plane, tolerance)
-        chosen = cells.ravel()[index]
-        if chosen.sum() < 10:
-            break
-        plane = np.linalg.lstsq(design[chosen], pz[chosen], rcond=None)[0]
-        spread = 1.4826 * float(np.median(np.abs(pz[chosen] - design[chosen] @ plane)))
-        tolerance = float(np.clip(3.5 * spread, 0.03, tolerance))
+    tolerance = float(np.clip(3.0 * np.median(sigma.ravel()[index]), 0.04, 0.25))
+    plane, cells = _settled(grid, index, design, pz, _lowest_plane(design, pz, tolerance), tolerance)
+    if cells.sum() >= SURE_SHARE * len(index):  # it is floor: now all of it, also where the map is bent
+        wide = max(tolerance, BENT_M)
+        plane, cells = _settled(grid, index, design, pz, _lowest_plane(design, pz, wide), wide)
     chosen = cells.ravel()[index]
     if _is_toe(grid, index, design, pz, plane, chosen, cells):
         cells, chosen = nothing, np.zeros_like(chosen)
     return _judged(grid, plane, centre, design, pz, chosen, cells, index)
+
+
+def _settled(grid: Grid, index: Index, design: Array, z: Array, plane: Array, tolerance: float) -> tuple[Array, Mask]:
+    """The plane and its cells, from a plane near it, with a tolerance that shrinks to what they spread by."""
+    cells = np.zeros(grid.shape, dtype=np.bool_)
+    for _ in range(6):
+        cells = _floor_cells(grid, index, design, z, plane, tolerance)
+        chosen = cells.ravel()[index]
+        if chosen.sum() < 10:
+            break
+        plane = np.asarray(np.linalg.lstsq(design[chosen], z[chosen], rcond=None)[0], dtype=np.float64)
+        spread = 1.4826 * float(np.median(np.abs(z[chosen] - design[chosen] @ plane)))
+        tolerance = float(np.clip(3.5 * spread, 0.03, tolerance))
+    return plane, cells
 
 
 def level_floor(grid: Grid, z_m: float) -> Floor:

@@ -32,6 +32,7 @@ class Evidence:
     grid: Grid
     cells: Cells
     surface: Surface
+    hidden_sigma_m: Array
     contact: Contact
     floor: Floor
     height_m: Array
@@ -68,7 +69,7 @@ def error_budget(e: Evidence) -> dict[str, float]:
         "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _face(e),
         "contact": _contact_height(e, area),
         "interpolated": gaps,
-        "unseen": hidden,
+        "unseen": math.hypot(hidden, _shadows(e)),
         "obstacles": _obstacles(e),
     }
 
@@ -149,6 +150,13 @@ def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:
         each = np.bincount(label.ravel(), (reach * weight).ravel(), minlength=n + 1)[1:]
         out.append(math.sqrt(float(np.sum(each**2))))
     return out[0], out[1]
+
+
+def _shadows(e: Evidence) -> float:
+    """What crests hide: one error for each patch."""
+    label, n = ndimage.label(e.hidden_sigma_m > 0)
+    each = np.bincount(label.ravel(), (e.hidden_sigma_m * e.grid.cell_area_m2 * e.share).ravel(), minlength=n + 1)[1:]
+    return math.sqrt(float(np.sum(each**2)))
 
 
 def roughness(e: Evidence) -> float:

@@ -95,6 +95,7 @@ def test_stray_returns_of_the_wall_make_no_peak_beside_it() -> None:
         points_map=points,
         keyframe_id=np.append(there.keyframe_id[hidden], none.astype(np.int64)),
         range_m=np.append(there.range_m[hidden], none),
+        scan_index=np.append(there.scan_index[hidden], none.astype(np.int64)),
     )
     after = estimate_volume(with_strays, CFG)
     assert after.volume_m3 == pytest.approx(before.volume_m3, abs=0.25)
