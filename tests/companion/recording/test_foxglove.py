@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -20,7 +21,9 @@ from stockpilot.replay_edit import rebuild_scans
 from tests.companion.recording.schema_check import faults
 
 SECONDS = 8
-REPLAYS = Path(__file__).resolve().parents[3] / "missions" / "replays"
+ROOT = Path(__file__).resolve().parents[3]
+REPLAYS = ROOT / "missions" / "replays"
+LAYOUT = ROOT / "docs" / "foxglove_layout.json"
 
 # What the viewers need to draw each schema (Foxglove's documentation of its message schemas), as we fill it.
 DRAWN = {
@@ -85,6 +88,32 @@ def test_raw_datagrams_are_what_their_ros_message_definition_says(flown: bytes) 
         assert datagram.host == ""
     assert min(sizes.values()) > 10_000
     assert len(sizes) == 2
+
+
+def test_layout_names_panels_the_viewers_know_and_fields_a_recording_has(flown: bytes) -> None:
+    layout = json.loads(LAYOUT.read_text())
+    panels = layout["configById"]
+    # The viewers' own names of panel types: the log panel is still called after ROS's /rosout.
+    assert Counter(name.split("!")[0] for name in panels) == {"3D": 1, "Plot": 2, "RosOut": 1}
+    assert sorted(_leaves(layout["layout"])) == sorted(panels)
+    frames, newest = set(), {}
+    for _, channel, message in make_reader(io.BytesIO(flown)).iter_messages():
+        if channel.message_encoding == "json":
+            newest[channel.topic] = content = json.loads(message.data)
+            for transform in content.get("transforms", ()):
+                frames |= {transform["parent_frame_id"], transform["child_frame_id"]}
+    scene = panels["3D!stockpilot"]
+    assert scene["followTf"] in frames
+    assert {*scene["topics"], panels["RosOut!stockpilot"]["topicToRender"]} <= newest.keys()
+    assert scene["topics"]["/points"]["colorField"] in {f["name"] for f in newest["/points"]["fields"]}
+    for path in (p["value"] for name in panels if name.startswith("Plot") for p in panels[name]["paths"]):
+        topic, field, index = re.fullmatch(r"([\w/]+)\.(\w+)(?:\[(\d+)\])?", path).groups()
+        value = newest[topic][field]
+        assert isinstance(value if index is None else value[int(index)], int | float), path
+
+
+def _leaves(node: dict | str) -> list[str]:
+    return [node] if isinstance(node, str) else _leaves(node["first"]) + _leaves(node["second"])
 
 
 @pytest.mark.parametrize(
