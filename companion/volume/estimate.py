@@ -23,6 +23,8 @@ from companion.volume.walls import Footprint, find_footprint
 MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
 
+LEAST_PILE_M = 0.12  # that a heap rises to
+LEAST_FOOT_M = 0.03
 RIM_M = 1.5  # of floor, around the material
 LEAST_KEYFRAMES = 6  # that see the floor, before their disagreement on it is judged
 LEAST_FROM_ABOVE = 0.3  # of the map's points
@@ -123,7 +125,7 @@ def _report(
         share=np.where(objects.cells, 0.0, footprint.share),
         warnings=(*footprint.warnings, *objects.warnings),
     )
-    pile = pile_mask(height, footprint.share > 0, cells, grid)
+    pile = pile_mask(height, footprint.share > 0, cells, floor, grid)
     area = grid.cell_area_m2 * footprint.share
     volume = float(np.sum((height * area)[pile]))
     position_sigma = max(point_map.position_sigma_m, footprint.pose_sigma_m)
@@ -183,7 +185,7 @@ def _seen_from_above(point_map: PointMap) -> PointMap:
     return point_map.only(keep) if keep.sum() >= LEAST_FROM_ABOVE * len(keep) else point_map
 
 
-def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
+def pile_mask(height: Array, inside: Mask, cells: Cells, floor: Floor, grid: Grid) -> Mask:
     """Where material lies, with a rim of floor all around it.
 
     The rim (RIM_M) makes the choice free of bias: heights are summed with their sign, and a foot too thin to be told
@@ -194,12 +196,16 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, grid: Grid) -> Mask:
     smooth = ndimage.uniform_filter(height * known, size, mode="constant")
     smooth /= np.maximum(ndimage.uniform_filter(known, size, mode="constant"), 1e-9)
     noise = float(np.nanmedian(cells.sigma_m[cells.seen])) if cells.seen.any() else 0.05
-    core = (smooth > max(0.12, 4.0 * noise)) & inside
-    label, n = ndimage.label(core)
-    if n:
-        area = np.bincount(label.ravel()) * grid.cell_area_m2
-        area[0] = 0.0
-        core = area[label] >= 1.0
+    least = max(LEAST_PILE_M, 4.0 * noise)
+    label, n = ndimage.label((smooth > least) & inside)
+    area = np.bincount(label.ravel(), minlength=n + 1) * grid.cell_area_m2
+    area[0] = 0.0
+    sure = area[label] >= 1.0
+    # Its foot may run out far: as far as it goes on, above what the floor departs from its plane by.
+    label, n = ndimage.label((smooth > np.clip(3.0 * floor.residual_m, LEAST_FOOT_M, least)) & inside)
+    holds = np.bincount(label.ravel(), sure.ravel(), minlength=n + 1) > 0
+    holds[0] = False
+    core = holds[label]
     return np.asarray(ndimage.binary_dilation(core, disc(cells_of(RIM_M, grid))) & inside)
 
 

@@ -22,6 +22,7 @@ from companion.volume.surface import Cells, CellState, Surface
 POSES_ALIKE = 6.0  # keyframes in a row that share most of their error
 LEAST_ERRORS = 3.0  # independent ones that a lap's poses average over, however short it was
 LEAST_FLOOR_CELLS = 50
+THIN_M, THIN_REACH_M = 0.003, 2.0  # of loose material that lies about a heap
 SHARED_WITH_FLOOR = 0.5  # of an error in height: the same scans see the floor, from which the material is counted
 
 
@@ -65,7 +66,7 @@ def error_budget(e: Evidence) -> dict[str, float]:
         # Heights drift with the tilt, which rough walls tell badly: a whole side shares it, however many keyframes it has.
         "height": e.height_sigma_m * pile_area * SHARED_WITH_FLOOR / math.sqrt(LEAST_ERRORS),
         "range": e.range_offset_sigma_m * abs(_per_range(e, area, flanks)),
-        "floor": _floor(e, area),
+        "floor": math.hypot(_floor(e, area), _thin(e)),
         "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _face(e),
         "contact": _contact_height(e, area),
         "interpolated": gaps,
@@ -115,6 +116,12 @@ def _floor(e: Evidence, area: Array) -> float:
     plane = float(design @ e.floor.covariance @ design)
     hidden = e.floor.undulation_m**2 * float(area.sum()) * BLOCK_M**2
     return math.sqrt(max(plane, 0.0) + hidden)
+
+
+def _thin(e: Evidence) -> float:
+    """What runs out beyond the rim too thin to be told from floor, or lifts what is taken for floor."""
+    along = e.pile & ~ndimage.binary_erosion(e.pile) & (e.depth_m > e.grid.cell_m)
+    return THIN_M * THIN_REACH_M * float(along.sum()) * e.grid.cell_m
 
 
 def _face(e: Evidence) -> float:

@@ -299,6 +299,33 @@ def test_box_on_the_floor_is_not_material() -> None:
     assert any("upright sides" in w for w in report.warnings)
 
 
+def test_box_at_the_foot_of_a_pile_is_not_material() -> None:
+    hall = Hall(footprint=rectangle(), pile=cone(25, 15, 4.0, 0.65), boxes=((30.0, 14.0, 32.0, 16.5, 2.2),))
+    report, error = measured(make_map(hall, QUICK, 3))
+    assert abs(error) < 0.6  # counted, the box is 5 %
+    assert any("upright sides" in w for w in report.warnings)
+
+
+def test_foot_that_runs_out_thin_is_counted() -> None:
+    hall = Hall(footprint=rectangle(), pile=lambda x, y: 3.0 * np.exp(-0.5 * ((x - 25.0) ** 2 + (y - 15.0) ** 2) / 9.0))
+    synthetic = make_map(hall, dataclasses.replace(QUICK, noise_m=0.03), 3)
+    report, error = measured(synthetic)
+    assert abs(error) < 0.6  # what lies beyond 0.12 m of height and a rim of a metre is 2 %
+    assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
+
+
+def test_floor_of_a_map_that_is_bent_is_all_of_it(free_standing: Synthetic) -> None:
+    """An attitude that is off by degrees bends floor and pile alike; the lowest third of the floor is not the floor."""
+    quiet = make_map(HALLS["free-standing"], dataclasses.replace(QUICK, noise_m=0.03), 3)
+    there = quiet.point_map
+    bent = there.points_map.copy()
+    bent[:, 2] += 0.04 * np.sin(bent[:, 0] / 8.0) * np.cos(bent[:, 1] / 8.0)
+    report = estimate_volume(dataclasses.replace(there, points_map=bent), CFG)
+    bare = quiet.true_points[:, 2] < 0.01
+    floor = report.floor_z_m[np.isfinite(report.floor_z_m)]
+    assert float(np.mean(floor)) == pytest.approx(float(np.mean(bent[bare, 2])), abs=0.008)
+
+
 def test_steep_cone_is_material_all_the_same() -> None:
     hall = Hall(footprint=rectangle(), pile=cone(25, 15, 2.5, 0.95))
     report, error = measured(make_map(hall, QUICK, 10))

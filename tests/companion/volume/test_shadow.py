@@ -1,0 +1,83 @@
+"""What a crest hides: a slope that rises to a crest, seen from its own side, and the wall behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from companion.messages import Array, PointMap
+from companion.volume.grid import Grid
+from companion.volume.shadow import STEEPEST_FALL, Shadow, lay_hidden
+from companion.volume.surface import CellState, Surface
+
+CELL_M = 0.25
+GRID = Grid(x0_m=0.0, y0_m=0.0, cell_m=CELL_M, nx=60, ny=60)  # 15 x 15 m
+CREST_X_M, CREST_Z_M, SLOPE = 11.0, 6.0, 0.6
+X, Y = GRID.centres()
+
+
+def carried_on() -> Array:
+    """As the surface is before: the slope goes on beyond the crest, up to the wall at x = 15 m."""
+    return CREST_Z_M + SLOPE * (X - CREST_X_M)
+
+
+def point_map(height_m: float, *, beams_to_wall: bool = True) -> PointMap:
+    """A path at x = 8 m along y; each place looks over the crest to the wall, and down the slope in front."""
+    path = np.column_stack([np.full(40, 8.0), np.linspace(0.5, 14.5, 40), np.full(40, height_m)])
+    over = (CREST_Z_M + 0.05 - height_m) / (CREST_X_M - 8.0)
+    on_wall = np.column_stack([np.full(40, 15.0), path[:, 1], np.full(40, height_m + 7.0 * over)])
+    in_front = np.column_stack([np.full(40, 5.0), path[:, 1], np.full(40, height_m - 3.0)])
+    ends = np.concatenate([in_front, on_wall] if beams_to_wall else [in_front, in_front])
+    scan = np.tile(np.arange(40), 2)
+    return PointMap(
+        points_map=np.repeat(ends, 2, axis=0),
+        keyframe_id=np.repeat(scan, 2),
+        range_m=np.ones(160),
+        path_map=path,
+        scan_index=np.repeat(scan, 2),
+    )
+
+
+def laid(seen: Array, of: PointMap) -> Shadow:
+    z = carried_on()
+    state = np.where(seen, CellState.SEEN, CellState.UNSEEN).astype(np.int8)
+    gap = ndimage.distance_transform_edt(~seen) * CELL_M
+    flat = np.zeros(GRID.shape)
+    surface = Surface(z_m=z, carried_m=z, state=state, gap_m=gap, slope_x=flat, slope_y=flat)
+    return lay_hidden(of, GRID, surface, np.zeros(GRID.shape), 0.03)
+
+
+def test_behind_a_crest_it_is_laid_between_sight_and_the_steepest_fall() -> None:
+    shadow = laid(X < CREST_X_M, point_map(7.0))
+    middle = np.argmin(np.abs(GRID.y_m - 7.5))
+    at = np.argmin(np.abs(GRID.x_m - 13.1))
+    behind_m = GRID.x_m[at] - CREST_X_M
+    z, sigma = shadow.surface.z_m[middle, at], shadow.sigma_m[middle, at]
+    sight, fallen = CREST_Z_M - behind_m * 0.95 / 3.0, CREST_Z_M - behind_m * STEEPEST_FALL
+    assert fallen < z < sight < carried_on()[middle, at]
+    assert z == pytest.approx((sight + fallen) / 2, abs=0.25)
+    assert sigma == pytest.approx((sight - fallen) / np.sqrt(12.0), abs=0.1)
+    assert shadow.surface.z_m[middle, 30] == carried_on()[middle, 30]
+
+
+def test_what_lies_in_sight_and_was_only_not_hit_stays_as_it_is() -> None:
+    """From high above the crest the sensor's steep beams look behind it."""
+    shadow = laid(X < CREST_X_M, point_map(14.0))
+    assert (shadow.surface.z_m == carried_on())[Y > 2.0].all()
+
+
+def test_gap_with_seen_places_all_around_stays_as_it_is() -> None:
+    seen = (np.abs(X - 12.5) > 0.6) | (np.abs(Y - 7.5) > 2.0)
+    shadow = laid(seen, point_map(7.0, beams_to_wall=False))
+    assert (shadow.surface.z_m == carried_on()).all()
+    assert not shadow.sigma_m.any()
+
+
+def test_map_that_does_not_tell_where_it_was_seen_from_stays_as_it_is() -> None:
+    of = point_map(7.0)
+    without = PointMap(
+        points_map=of.points_map, keyframe_id=of.keyframe_id, range_m=of.range_m, path_map=np.zeros((0, 3))
+    )
+    shadow = laid(X < CREST_X_M, without)
+    assert (shadow.surface.z_m == carried_on()).all()
