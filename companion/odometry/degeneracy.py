@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.messages import Array
-from companion.odometry import kernels
+from companion.odometry.solve_kernels import without_translation
 from companion.odometry.wall_map import Registration
 
 # Of the translation's information; a hall has about 0.2, a corridor 0.004 (measured). With 0.01 a hall of 120 m with pilasters,
@@ -63,7 +63,7 @@ def weak_direction(information: Array) -> tuple[float, Array]:
 
 def is_yaw_weak(information: Array) -> bool:
     """True when the walls alone leave yaw to more than 2 deg (round silo: turning changes nothing)."""
-    return bool(kernels.without_translation(information) < WEAK_YAW_INFORMATION)
+    return bool(without_translation(information) < WEAK_YAW_INFORMATION)
 
 
 def _refusal(registration: Registration, guess: Array, guess_covariance: Array, points: int) -> str:

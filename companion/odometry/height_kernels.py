@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from companion.jit import kernel
 from companion.messages import Array
 from companion.odometry.jackknife import SECTORS, shared_by_sector
-from companion.odometry.kernels import TUKEY
+from companion.odometry.solve_kernels import solve_robustly, without
 
 WINDOW = 1
 W, X, Y, Z, XX, XY, YY, XZ, YZ, ZZ, VZ = range(11)
@@ -180,75 +180,6 @@ def classify(
 
 
 @kernel
-def solve_spd(a: Array, b: Array) -> Array:
-    """Solve a small symmetric positive definite system by Cholesky."""
-    n = len(b)
-    low = np.zeros((n, n))
-    y, x = np.zeros(n), np.zeros(n)
-    for i in range(n):
-        for j in range(i + 1):
-            total = a[i, j]
-            for k in range(j):
-                total -= low[i, k] * low[j, k]
-            low[i, j] = math.sqrt(max(total, 1e-12)) if i == j else total / low[j, j]
-    for i in range(n):
-        y[i] = b[i]
-        for k in range(i):
-            y[i] -= low[i, k] * y[k]
-        y[i] /= low[i, i]
-    for i in range(n - 1, -1, -1):
-        x[i] = y[i]
-        for k in range(i + 1, n):
-            x[i] -= low[k, i] * x[k]
-        x[i] /= low[i, i]
-    return x
-
-
-@kernel
-def without(h: Array, keep: int) -> Array:
-    """Information of the first `keep` unknowns when the others are left free (Schur complement)."""
-    n = h.shape[0]
-    out = h[:keep, :keep].copy()
-    for k in range(keep):
-        part = solve_spd(h[keep:, keep:].copy(), h[keep:, k].copy())
-        for j in range(keep):
-            for m in range(n - keep):
-                out[j, k] -= h[j, keep + m] * part[m]
-    return out
-
-
-@kernel
-def _solve_robustly(jac: Array, res: Array, var: Array, prior: Array, iterations: int) -> tuple[Array, Array, float]:
-    """Tukey-weighted least squares of res + jac x with x about 0; returns x, the points' information and the scale."""
-    n, m = jac.shape
-    x = np.zeros(m)
-    h = np.zeros((m, m))
-    u = np.empty(n)
-    scale = 1.0
-    for _ in range(iterations):
-        for i in range(n):
-            total = res[i]
-            for k in range(m):
-                total += jac[i, k] * x[k]
-            u[i] = total / math.sqrt(var[i])
-        scale = min(max(1.4826 * np.median(np.abs(u)), 0.7), 4.0)
-        h[:] = 0.0
-        g = prior @ x
-        for i in range(n):
-            v = u[i] / (TUKEY * scale)
-            if abs(v) >= 1.0:
-                continue
-            w = (1.0 - v * v) ** 2 / (var[i] * scale * scale)
-            r = u[i] * math.sqrt(var[i])
-            for k in range(m):
-                g[k] += w * jac[i, k] * r
-                for j in range(m):
-                    h[k, j] += w * jac[i, k] * jac[i, j]
-        x = x - solve_spd(h + prior, g)
-    return x, h, scale
-
-
-@kernel
 def _wall_rows(
     standing: Array, points: Array, pose: Array, kind: NDArray[np.int64], sigma_range_m: float, lean: Array
 ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
@@ -345,7 +276,7 @@ def fit_height(
     prior[:4, :4] = tilt_prior
     prior[4:, 4:] = shift_prior
     if len(res) > 0:
-        tilt, h, scale = _solve_robustly(jac, res, var, prior, iterations)
+        tilt, h, scale = solve_robustly(jac, res, var, prior, iterations)
         correction[1:] = tilt[:4]
         h[4:, 4:] += shift_prior
         information[1:, 1:] = without(h, 4)
@@ -362,7 +293,7 @@ def fit_height(
         slope_prior[0, 0] = 1e-3
         slope_prior[1, 1] = 1.0 / (left[0, 0] + bend_variance)
         slope_prior[2, 2] = 1.0 / (left[1, 1] + bend_variance)
-        height, h, out[2] = _solve_robustly(jac, res, var, slope_prior, iterations)
+        height, h, out[2] = solve_robustly(jac, res, var, slope_prior, iterations)
         correction[0] = height[0]
         information[0, 0] = without(h + slope_prior, 1)[0, 0]
     return correction, information, out
@@ -405,5 +336,5 @@ def shift_along(
     prior[0, 0] = 1e-6
     for j in range(3):
         prior[1 + j, 1 + j] = 1.0 / variances[j]
-    moved, h, _ = _solve_robustly(jac, res, var, prior, iterations)
+    moved, h, _ = solve_robustly(jac, res, var, prior, iterations)
     return float(moved[0]), max(float(without(h + prior, 1)[0, 0]), 0.0)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from companion.jit import kernel
 from companion.messages import Array
-from companion.odometry.kernels import TUKEY
+from companion.odometry.solve_kernels import TUKEY
 
 SECTORS = 24  # of the turn: what points of one err by together is what a wall's bumps do
 

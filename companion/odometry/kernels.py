@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from companion.jit import kernel
 from companion.messages import Array
+from companion.odometry.solve_kernels import TUKEY, solve3, without_translation
 
 WINDOW = 2
 # sums of a cell: weight, x, y, xx, xy, yy, pose variance in x, y, yaw
@@ -28,7 +29,6 @@ DIRTY, VALID, NO_LINE = 0, 1, 2
 MIN_WEIGHT = 5.0
 MAX_SLENDER = 0.35  # variance across / along above which a window holds no line
 ANGULAR_SIGMA_RAD = 0.0015  # of a beam's direction: time stamps, attitude, the sensor's own
-TUKEY = 4.685
 NORMAL_SIGMA_RAD = 0.02  # what the normal of a window errs by however many points it holds: curves, steps
 NEIGHBOURS = 4  # on each side of a point
 CORRELATED = 8.0  # points of one scan that share a line, and so its error
@@ -286,32 +286,6 @@ def normal_equations(
     system[2, 0] = system[0, 2]
     system[2, 1] = system[1, 2]
     return unsure
-
-
-@kernel
-def solve3(a: Array, b: Array) -> Array:
-    """Solve a symmetric positive definite (3, 3) system by Cholesky."""
-    l00 = math.sqrt(max(a[0, 0], 1e-12))
-    l10, l20 = a[1, 0] / l00, a[2, 0] / l00
-    l11 = math.sqrt(max(a[1, 1] - l10 * l10, 1e-12))
-    l21 = (a[2, 1] - l20 * l10) / l11
-    l22 = math.sqrt(max(a[2, 2] - l20 * l20 - l21 * l21, 1e-12))
-    y0 = b[0] / l00
-    y1 = (b[1] - l10 * y0) / l11
-    y2 = (b[2] - l20 * y0 - l21 * y1) / l22
-    x = np.empty(3)
-    x[2] = y2 / l22
-    x[1] = (y1 - l21 * x[2]) / l11
-    x[0] = (y0 - l10 * x[1] - l20 * x[2]) / l00
-    return x
-
-
-@kernel
-def without_translation(system: Array) -> float:
-    """Information about yaw when x and y are left free; at least 0."""
-    a, b, c = system[0, 0] + 1e-6, system[0, 1], system[1, 1] + 1e-6
-    u, v = system[0, 2], system[1, 2]
-    return max(float(system[2, 2] - (c * u * u - 2.0 * b * u * v + a * v * v) / max(a * c - b * b, 1e-12)), 0.0)
 
 
 @kernel

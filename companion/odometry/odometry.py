@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -28,31 +28,24 @@ from companion.messages import (
 from companion.odometry import filter as kalman
 from companion.odometry import weak
 from companion.odometry.attitude import AttitudeBuffer, AttitudeHistory
-from companion.odometry.degeneracy import Judgement, judge, weak_direction
+from companion.odometry.degeneracy import Judgement
 from companion.odometry.estimate import Snapshot, estimate_at
 from companion.odometry.height import HeightTracker
 from companion.odometry.keyframes import PlacedScan, WaitingScans
 from companion.odometry.level import LOW_M, AllReturns, Leveller, ReturnNoise, block_means, wall_layer
+from companion.odometry.placing import FAILED_AFTER, Placing
 from companion.odometry.ranges import SCANS, layer_ranges, wall_ranges
-from companion.odometry.relocalise import relocalise
 from companion.odometry.specks import specks, without_dust
 from companion.odometry.standstill import Standstill
 from companion.odometry.wall_map import Registration, WallMap
 
-PRIOR_COVARIANCE = np.diag(np.array([0.06, 0.06, 0.02]) ** 2)  # m, m, rad: holds a registration where the walls do not
-FLOOR_VARIANCE = np.array([0.004, 0.004, 0.0004]) ** 2  # what a registration errs by at best: roughness, time stamps
 KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
 KEYFRAME_HEIGHT_LOW_M = 0.2  # below LOW_M, where nothing yet tells walls from the foot of a pile
-FAILED_AFTER = 3  # rejected scans in a row: quality -1 (FAULTS.md 8)
 MIN_VALID_COLUMNS_RATIO = 0.25
 WAIT_FOR_FIRST_SCANS = 5
 MIN_VALID_COLUMNS_FIRST_RATIO = 0.75  # the first scan makes the map: one that was joined in mid-turn would ruin it
-LEAST_NOISE_RATIO = 0.8  # of the noise of single returns: oblique ones err less across their wall
-SUDDEN_LOSS = 0.15  # share of the layer's points that lose their wall at once
-MIN_JUMP_M = 0.2
 DUST_SIGMA_M = 0.05  # of x and y, were all returns dust: what is left of it before the walls shrinks the map
 DUST_RATE = 0.01
-MOST_LOW_SCANS = 100  # a take-off is over by then: what stays low was not taking off
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,27 +77,28 @@ class Odometry:
         self._rangefinder: list[RangefinderSample] = []
         self._snapshot: Snapshot | None = None
         self._published: Snapshot | None = None
-        self.walls = WallMap()
+        self._placing = Placing()
         self.height = HeightTracker(cfg.lidar.mount_position_m[2])
         self._standstill = Standstill()
         self._is_released = False  # the filter, from standing at the origin
         self._standing_scans = 0
         self._waiting = WaitingScans()
         self._layers: deque[Array] = deque(maxlen=SCANS)  # of the last scans, newest first
-        self._sigma_range_m = 0.1
         self._return_noise = ReturnNoise()  # of single returns: the registration's also holds what walls are rough by
         self._dust_ratio = 0.0  # of the returns, lately
-        self._accepted = 0
-        self._usual_share = 0.0  # of the layer's points that found a wall, lately
-        self._is_weak, self._is_lost = False, False  # along an axis: not held by walls; nor known well enough to map
-        self._held_by_walls = np.zeros((2, 2))  # translation's information while weak, over some scans
-        self._rejected_in_row = 0
-        self._low_scans = 0  # since it no longer stands, until it has been higher than LOW_M
         self._keyframe_t_ns = 0
         self._keyframe_z_m = 0.0
         self._base_variance = np.zeros(3)
         self.dropped: dict[str, int] = {"repeated": 0, "no attitude": 0, "too few columns": 0}
-        self.rejected: dict[str, int] = {}
+
+    @property
+    def walls(self) -> WallMap:
+        return self._placing.walls
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Scans whose registration was not believed, by why."""
+        return self._placing.rejected
 
     # -- inputs
 
@@ -186,16 +180,21 @@ class Odometry:
             self._return_noise.sigma_m,
             is_climbing=self._is_released,
         )
-        near_m = self._cfg.lidar.min_range_m + 4.0 * self._sigma_range_m
+        near_m = self._cfg.lidar.min_range_m + 4.0 * self._placing.sigma_range_m
         lower = block_means(levelled, row, scan.range_m.shape[1], near_m)
         registration, judgement = None, None
         if old is None:
             snapshot = self._first(scan, planar, vertical)
-            ground = self.height.fit(lower, planar, vertical, self.walls, self._sigma_range_m).new_ground
+            ground = self.height.fit(lower, planar, vertical, self.walls, self._placing.sigma_range_m).new_ground
         else:
-            planar, registration, judgement, reset = self._place(planar, layer, float(vertical.x[0]), old.t_scan_ns)
+            planar, registration, judgement, reset = self._placing.place(
+                planar, layer, float(vertical.x[0]), old.t_scan_ns,
+                is_standing=self._standstill.is_standing, return_sigma_m=self._return_noise.sigma_m,
+            )  # fmt: skip
             self.height.is_standing = self._standstill.is_standing
-            vertical, fit = self.height.update(lower, planar, vertical, history, self.walls, self._sigma_range_m)
+            vertical, fit = self.height.update(
+                lower, planar, vertical, history, self.walls, self._placing.sigma_range_m
+            )
             ground = fit.new_ground
             if judgement.is_degenerate and self._is_released:
                 planar = self._hold_by_ground(planar, vertical, judgement.weak_axis, lower, fit.correction[1:])
@@ -205,7 +204,7 @@ class Odometry:
                 )
             snapshot = self._after(old, scan, planar, vertical, registration, judgement, reset)
         variance = np.array([planar.p[0, 0], planar.p[1, 1], planar.p[6, 6], vertical.p[0, 0]]) + snapshot.map_variance
-        if judgement is None or (judgement.is_accepted and not self._is_lost):
+        if judgement is None or (judgement.is_accepted and not self._placing.is_lost):
             sensor = levelled.origin_level_m
             pose, z_m = planar.x[kalman.POSE], float(vertical.x[0])
             self._waiting.add(PlacedScan(layer, ground, sensor, pose, z_m, variance))
@@ -249,8 +248,10 @@ class Odometry:
         return MIN_VALID_COLUMNS_FIRST_RATIO if is_waiting else MIN_VALID_COLUMNS_RATIO
 
     def _first(self, scan: LidarScan, planar: kalman.Planar, vertical: kalman.Vertical) -> Snapshot:
-        if self._return_noise.sigma_m > 2.0 * self._sigma_range_m:  # else the second scan would not fit the first
-            self._sigma_range_m = self._return_noise.sigma_m
+        if (
+            self._return_noise.sigma_m > 2.0 * self._placing.sigma_range_m
+        ):  # else the second scan would not fit the first
+            self._placing.sigma_range_m = self._return_noise.sigma_m
         return Snapshot(
             t_scan_ns=scan.t_ns,
             planar=planar,
@@ -268,118 +269,16 @@ class Odometry:
             is_keyframe=True,
         )
 
-    def _place(
-        self, planar: kalman.Planar, layer: Array, z_m: float, before_ns: int
-    ) -> tuple[kalman.Planar, Registration, Judgement, bool]:
-        """Register the layer from the predicted pose; fuse it if it can be believed; search if it failed for long."""
-        guess = planar.x[kalman.POSE]
-        covariance = planar.p[kalman.POSE_BLOCK]
-        prior = np.asarray(np.linalg.inv(covariance + PRIOR_COVARIANCE), np.float64)
-        registration = self.walls.register(layer, guess, prior, z_m=z_m, sigma_range_m=self._sigma_range_m)
-        judgement = judge(registration, guess, covariance, len(layer))
-        may_jump = judgement.is_accepted and not self._is_lost
-        if may_jump and self._is_misplaced(registration, layer, guess, covariance, z_m):
-            judgement = replace(judgement, refused_because="fits better elsewhere")
-        if self._is_lost or (judgement.is_degenerate and judgement.is_accepted):
-            axis = self._weak_axis(planar, registration, judgement)
-            return self._place_weakly(planar, layer, z_m, prior, axis, before_ns)
-        if judgement.is_accepted:
-            self._rejected_in_row = 0
-            self._accepted += 1
-            self._track_noise(registration.scale)
-            seen, apparent = registration.information, registration.apparent_information
-            held = judgement.is_yaw_weak
-            planar = kalman.update(planar, registration.pose, seen, apparent, prior, FLOOR_VARIANCE, holds_yaw=held)
-            was_weak, self._is_weak = self._is_weak, False
-            return planar, registration, judgement, was_weak and _is_jump(planar.x, guess)
-        self._rejected_in_row += 1
-        self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
-        if self._rejected_in_row >= FAILED_AFTER:
-            found = relocalise(self.walls, layer, guess, covariance, z_m, self._sigma_range_m)
-            anew = judge(found, found.pose, covariance, len(layer)) if found is not None else judgement
-            if found is not None and not anew.is_degenerate:
-                self._rejected_in_row = 0
-                return kalman.restart(planar, found.pose), found, anew, True
-        return planar, registration, judgement, False
-
-    def _weak_axis(self, planar: kalman.Planar, registration: Registration, judgement: Judgement) -> Array:
-        """(2,) in map; over some scans: were it to turn with each, what each leaves of it would add up."""
-        if not judgement.is_degenerate:
-            return weak.widest_axis(planar)
-        memory = weak.AXIS_MEMORY if self._is_weak else 0.0
-        self._held_by_walls = memory * self._held_by_walls + registration.information[:2, :2]
-        return weak_direction(self._held_by_walls)[1]
-
-    def _place_weakly(
-        self, planar: kalman.Planar, layer: Array, z_m: float, prior: Array, axis: Array, before_ns: int
-    ) -> tuple[kalman.Planar, Registration, Judgement, bool]:
-        """Register across the weak axis only; search along it once the position there is lost and walls are missing."""
-        guess = planar.x[kalman.POSE]
-        covariance = planar.p[kalman.POSE_BLOCK]
-        planar = weak.settle(planar, axis, (planar.t_ns - before_ns) * 1e-9)
-        noise, prior_held = self._sigma_range_m, weak.held(prior, axis)
-        registration = self.walls.register(layer, guess, prior_held, z_m=z_m, sigma_range_m=noise)
-        judgement = judge(registration, guess, covariance, len(layer))
-        sigma_m = weak.sigma_along(planar, axis)
-        is_missing = registration.inliers < (1.0 - weak.MISSING_RATIO) * len(layer)
-        if self._is_lost and (is_missing or not judgement.is_degenerate):
-            found = weak.find_along(self.walls, layer, guess, axis, sigma_m, z_m, noise)
-            if found is not None:
-                self._rejected_in_row, self._is_weak, self._is_lost = 0, False, False
-                judgement = judge(found, found.pose, covariance, len(layer))
-                return weak.found_again(planar, found.pose), found, judgement, _is_jump(found.pose, guess)
-        judgement = replace(judgement, is_degenerate=True, weak_axis=axis)
-        if judgement.is_accepted:
-            self._rejected_in_row = 0
-            self._accepted += 1
-            self._track_noise(registration.scale)
-            seen, apparent = weak.without_axis(registration, axis)
-            floor = FLOOR_VARIANCE + weak.axis_variance(sigma_m)
-            planar = kalman.update(planar, registration.pose, seen, apparent, prior, floor)
-        else:
-            self._rejected_in_row += 1
-            self.rejected[judgement.refused_because] = self.rejected.get(judgement.refused_because, 0) + 1
-        self._is_weak, self._is_lost = True, weak.sigma_along(planar, axis) > weak.LOST_M
-        return planar, registration, judgement, False
-
     def _hold_by_ground(
         self, planar: kalman.Planar, vertical: kalman.Vertical, axis: Array, lower: Array, tilt: Array
     ) -> kalman.Planar:
         """Where walls do not hold the place along an axis, a pile in sight does. It stays degenerate all the same: nothing
         holds the tilt along that axis, and heights drift."""
-        noise = self._sigma_range_m
+        noise = self._placing.sigma_range_m
         moved_m, information = self.height.shift_along(lower, planar, vertical, self.walls, noise, axis, tilt)
         planar = weak.held_by_ground(planar, axis, moved_m, information)
-        self._is_lost = weak.sigma_along(planar, axis) > weak.LOST_M
+        self._placing.is_lost = weak.sigma_along(planar, axis) > weak.LOST_M
         return planar
-
-    def _is_misplaced(
-        self, registration: Registration, layer: Array, guess: Array, covariance: Array, z_m: float
-    ) -> bool:
-        """Whether walls went missing all at once and are found again from a pose elsewhere.
-
-        Walls along the way of motion fit as well after a jump along them: only those across it are missed. Until it has
-        risen the foot of a pile passes for a wall, and a tilted layer meets it higher and farther off: no place to go to.
-        """
-        if not self._standstill.is_standing:
-            self._low_scans = MOST_LOW_SCANS if z_m > LOW_M else self._low_scans + 1
-        share = registration.inliers / max(len(layer), 1)
-        lost = self._usual_share - share
-        self._usual_share += 0.1 * (share - self._usual_share)
-        if lost < SUDDEN_LOSS or self._standstill.is_standing or self._low_scans < MOST_LOW_SCANS:
-            return False
-        found = relocalise(self.walls, layer, guess, covariance, z_m, self._sigma_range_m)
-        if found is None or found.inliers < registration.inliers + SUDDEN_LOSS * len(layer):
-            return False
-        self._usual_share = max(self._usual_share, found.inliers / len(layer))
-        return _is_jump(found.pose, registration.pose)
-
-    def _track_noise(self, scale: float) -> None:
-        """Learn the range noise from the residuals: fast at first, then slowly; it is no less than that of returns. (In a
-        climb residuals are small beside what walls may lean by, and tell of no noise.)"""
-        rate = max(0.01, 0.3 / (1 + self._accepted / 5))
-        least = max(0.01, LEAST_NOISE_RATIO * self._return_noise.sigma_m)
-        self._sigma_range_m = min(max(self._sigma_range_m * scale**rate, least), 0.5)
 
     def _stand(
         self,
@@ -427,7 +326,7 @@ class Odometry:
         z_m = float(vertical.x[0])
         step_m = KEYFRAME_HEIGHT_M if z_m > LOW_M else KEYFRAME_HEIGHT_LOW_M
         climbed = abs(z_m - self._keyframe_z_m) > step_m
-        is_keyframe = accepted and not self._is_lost and (due or climbed)
+        is_keyframe = accepted and not self._placing.is_lost and (due or climbed)
         planar_map = old.map_variance[:3]
         if accepted:
             dust = (DUST_SIGMA_M * self._dust_ratio) ** 2
@@ -437,7 +336,7 @@ class Odometry:
         quality = max(1, min(100, round(100 * registration.matched_ratio))) if accepted else old.quality
         if judgement.is_degenerate:
             quality = weak.quality_at(weak.sigma_along(planar, judgement.weak_axis), quality)
-        if self._rejected_in_row >= FAILED_AFTER:
+        if self._placing.rejected_in_row >= FAILED_AFTER:
             quality = -1
         return Snapshot(
             t_scan_ns=scan.t_ns,
@@ -460,7 +359,3 @@ class Odometry:
         is_standing = self._standstill.is_standing and not is_first
         self._waiting.put_into(self.walls, self.height.ground, self._return_noise.sigma_m, is_standing=is_standing)
         self._keyframe_t_ns, self._keyframe_z_m = t_ns, z_m
-
-
-def _is_jump(pose: Array, before: Array) -> bool:
-    return math.hypot(pose[0] - before[0], pose[1] - before[1]) > MIN_JUMP_M

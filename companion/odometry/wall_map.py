@@ -13,6 +13,7 @@ import numpy as np
 from companion.messages import Array
 from companion.odometry import kernels
 from companion.odometry.grid_growth import growth
+from companion.odometry.solve_kernels import without_translation
 
 # 1/rad2: information about yaw, x and y left free, below which it is doubted: a hall's walls give twenty times as much; so
 # little comes from a few things in a round store that are no straight walls, and errs alike from scan to scan.
@@ -107,7 +108,7 @@ class WallMap:
         )
         believed = information.copy()
         believed[2, 2] -= out[9]
-        of_yaw = kernels.without_translation(believed)
+        of_yaw = without_translation(believed)
         believed[2, 2] -= of_yaw * DOUBTED_YAW / (of_yaw + DOUBTED_YAW)
         return Registration(
             pose=pose,

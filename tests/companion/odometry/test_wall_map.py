@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.odometry import height_kernels, kernels
+from companion.odometry import kernels, solve_kernels
 from companion.odometry.degeneracy import is_yaw_weak, judge, weak_direction
 from companion.odometry.relocalise import relocalise
 from companion.odometry.wall_map import WallMap
@@ -162,8 +162,8 @@ def test_small_solvers_agree_with_numpy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a = rng.normal(size=(3, 5))
     spd, b = a @ a.T + 0.1 * np.eye(3), rng.normal(size=3)
-    assert np.allclose(kernels.solve3(spd, b), np.linalg.solve(spd, b), rtol=1e-6, atol=1e-9)
+    assert np.allclose(solve_kernels.solve3(spd, b), np.linalg.solve(spd, b), rtol=1e-6, atol=1e-9)
     a = rng.normal(size=(4, 6))
     spd, b = a @ a.T + 0.1 * np.eye(4), rng.normal(size=4)
-    assert np.allclose(height_kernels.solve_spd(spd, b), np.linalg.solve(spd, b), rtol=1e-6, atol=1e-9)
-    assert np.allclose(height_kernels.without(spd, 2), np.linalg.inv(np.linalg.inv(spd)[:2, :2]))
+    assert np.allclose(solve_kernels.solve_spd(spd, b), np.linalg.solve(spd, b), rtol=1e-6, atol=1e-9)
+    assert np.allclose(solve_kernels.without(spd, 2), np.linalg.inv(np.linalg.inv(spd)[:2, :2]))
