@@ -67,7 +67,7 @@ sweep: setup
 	$(BIN)/stockpilot sweep missions/paper_sweep.yaml --docs docs/results.md
 
 campaign: setup
-	for sweep in acceptance worlds noise dust walls wind vibration attitude mount packets interval; do \
+	for sweep in acceptance worlds starts others noise dust walls wind vibration attitude mount packets interval; do \
 	  $(BIN)/stockpilot sweep missions/sweeps/$$sweep.yaml --docs docs/results.md || true; done
 
 replay: setup

@@ -238,10 +238,12 @@ def _box_plots(results: Sequence[Result]) -> bytes:
                 continue
             drawn = axis.boxplot(
                 values, positions=[n + offset for n in range(len(groups))], widths=0.28, patch_artist=True,
-                medianprops={"color": "black"}, flierprops={"markersize": 3},
+                medianprops={"color": "black"}, showfliers=False,
             )  # fmt: skip
             for box in drawn["boxes"]:
-                box.set(facecolor=colour, alpha=0.75)
+                box.set(facecolor=colour, alpha=0.5)
+            for n, each in enumerate(values):  # every flight: a box of one would be but a dash
+                axis.plot(np.full(len(each), n + offset), each, ".", color=colour, markersize=5, zorder=3)
             axis.plot([], [], "s", color=colour, label=label)
         axis.set_ylabel(title)
         if key in ("e_p_m", "e_v_percent"):
