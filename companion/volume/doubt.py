@@ -83,7 +83,7 @@ def doubt(
             "their heights or the attitude are off"
         )
         # An attitude that is off bends floor and pile alike all along the lap: that does not average out.
-        extra.append(0.5 * e.floor_disagreement_m * pile_area)
+        extra.append(e.floor_disagreement_m * pile_area)
     if cells.dropped_ratio > IN_THE_AIR:
         said.append(f"{100 * cells.dropped_ratio:.0f} % of the returns were not of the surface: dust, or poor poses")
         extra.append(0.1 * cells.dropped_ratio * abs(volume_m3))
