@@ -26,6 +26,7 @@ LEAST_AREA_M2 = 0.2  # on the floor
 LEAST_AREA_IN_PILE_M2 = 0.5
 UPRIGHT_SHARE = 0.6  # of the outline: corners and hidden sides blur
 DOUBTED_SHARE = 0.3  # from here on it may be one that a pile hides in part
+LEVEL_TOP = 0.3  # spread of heights over the height above the outline
 RIM_CELLS = 2
 LEAST_STEEP_M2 = 1.0  # of steep cells within the pile before it is said
 
@@ -62,7 +63,7 @@ def find_objects(grid: Grid, height: Array, inside: Mask, trusted: Mask) -> Obje
                 cells |= body
                 covered |= ndimage.binary_dilation(body, disc(RIM_CELLS))
                 warnings.append(_said(grid, h, body))
-            elif share >= DOUBTED_SHARE and not (doubted & body).any():
+            elif share >= DOUBTED_SHARE and not (doubted & body).any() and _has_level_top(h, body, float(level)):
                 doubted |= body
                 doubtful.append((body, float((h[body] - level).sum()) * grid.cell_area_m2))
     left = face & ~covered
@@ -109,6 +110,15 @@ def _upright_share(body: Mask, steep: Mask) -> float:
     outline = body & ~ndimage.binary_erosion(body)
     upright = ndimage.binary_dilation(steep & ndimage.binary_dilation(body))
     return float(upright[outline].mean())
+
+
+def _has_level_top(h: Array, body: Mask, level: float) -> bool:
+    """As things have, and loose material with flanks as steep has not."""
+    top = h[ndimage.binary_erosion(body)]
+    if top.size < 3:
+        return True
+    low, middle, high = np.quantile(top, [0.1, 0.5, 0.9])
+    return bool(high - low < LEVEL_TOP * (middle - level))
 
 
 def _said(grid: Grid, h: Array, body: Mask) -> str:
