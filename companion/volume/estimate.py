@@ -29,6 +29,7 @@ RIM_M = 1.5  # of floor, around the material
 LEAST_KEYFRAMES = 6  # that see the floor, before their disagreement on it is judged
 LEAST_FROM_ABOVE = 0.3  # of the map's points
 BESIDE_WALLS_M = 1.0  # beyond the strip
+SLIVERS_M = 0.5  # the same
 
 
 def estimate_volume(
@@ -74,8 +75,15 @@ def estimate_volume(
         floor = fit_floor(grid, cells.x, cells.y, cells.z, cells.sigma_m, usable)
     else:
         floor = level_floor(grid, floor_z_m)
+    # Beside the strip slivers between cells far apart along the wall would bridge what the slope tells.
+    beside = (footprint.depth_m < footprint.margin_m + SLIVERS_M) & ~cells.seen
     surface = build_surface(
-        grid, cells, footprint.share > 0, strip, reach_m=INTERPOLATION_REACH_M, strip_width_m=footprint.margin_m
+        grid,
+        cells,
+        footprint.share > 0,
+        strip | beside,
+        reach_m=INTERPOLATION_REACH_M,
+        strip_width_m=footprint.margin_m,
     )
     surface, contact = _meet_walls(points, grid, np.where(low, key, -1), footprint, floor, surface)
     shadow = lay_hidden(point_map, grid, surface, floor.z(*grid.centres()), footprint.noise_m)

@@ -22,6 +22,7 @@ APART_M = 2.5  # between the places of the path that are looked from
 LEAST_PLACES = 4
 LOOK_M = 12.0  # from farther off the sensor's few layers leave gaps of their own
 PASSED_M = 8.0  # of a beam before its end: what it passed over at the walls and behind crests
+PASSED_NOISE_M = 0.05  # the lowest of many beams is low by as much
 AROUND_M = 6.0  # looked for seen places
 SIDES = 16
 HIDDEN_M = 0.15  # a fall of less is within what interpolation errs by
@@ -64,7 +65,7 @@ def lay_hidden(point_map: PointMap, grid: Grid, surface: Surface, floor_z: Array
     highest = np.maximum(np.minimum(z, passed), lowest)
     is_hidden = ~is_enclosed & (np.minimum(highest, in_sight) - lowest > HIDDEN_M)
     z_m, sigma_m = surface.z_m.copy(), np.zeros(grid.shape)
-    z_m[gaps] = np.where(is_hidden, 0.5 * (highest + lowest), z)
+    z_m[gaps] = np.where(is_hidden, 0.5 * (highest + lowest), np.minimum(z, highest + PASSED_NOISE_M))
     sigma_m[gaps] = np.where(is_hidden, (highest - lowest) / math.sqrt(12.0), 0.0)
     return Shadow(surface=replace(surface, z_m=z_m), sigma_m=sigma_m)
 

@@ -5,23 +5,17 @@ from __future__ import annotations
 import gzip
 import json
 import random
-import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 import typer
-from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from companion import topics
-from companion.messages import WallRanges
-from companion.recording.log import MCAP_NAME
 from companion.recording.manifest import write_manifest
 from stockpilot.info import contents_of, info_command
 from stockpilot.recover import recover_command
 from tests.companion.recording.samples import small_recording
-from tests.companion.recording.test_log import a_recorder, an_estimate, fill, heartbeats
+from tests.companion.recording.test_log import a_recorder, fill, heartbeats
 from tests.shared_data import shared_data
 
 RUNNER = CliRunner()
@@ -128,29 +122,3 @@ def test_packed_log_that_is_cut_is_not_sound(tmp_path: Path) -> None:
     code, said = run(info_command, tmp_path / "cut")
     assert code == 1
     assert "cut" in json.dumps(said["drops"])
-
-
-def test_shipped_layout_shows_what_a_recording_holds(tmp_path: Path) -> None:
-    """Every topic and field that a panel of docs/foxglove_layout.json names is there, and a plot's is a number."""
-    recorder = a_recorder(tmp_path)
-    estimate = an_estimate(2_000_000_000)
-    walls = WallRanges(
-        t_ns=2, front_m=3.0, right_m=2.0, ranges_m=np.full(360, 4.0), is_seen=np.ones(360, dtype=np.bool_)
-    )
-    recorder.tap(topics.ESTIMATE, 2_000_000_000, estimate)
-    recorder.tap(topics.WALLS, 2_000_000_000, walls)
-    recorder.close()
-    with (tmp_path / MCAP_NAME).open("rb") as file:
-        reader = make_reader(file)
-        channels = {c.topic for c in reader.get_summary().channels.values()}
-        sent = {c.topic: json.loads(m.data) for _, c, m in reader.iter_messages()}
-    panels = json.loads((ROOT / "docs" / "foxglove_layout.json").read_text())["configById"]
-    assert {name.split("!")[0] for name in panels} == {"3D", "Plot", "Log"}
-    drawn = [*panels["3D!stockpilot"]["topics"], panels["Log!stockpilot"]["topicToRender"]]
-    assert set(drawn) <= channels
-    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
-    assert paths
-    for path in paths:
-        topic, field, index = re.fullmatch(r"([a-z_/]+)\.(\w+)(?:\[(\d)\])?", path).groups()
-        value = sent[topic][field]
-        assert isinstance(value if index is None else value[int(index)], int | float), path

@@ -27,7 +27,7 @@ def point_map(height_m: float, *, beams_to_wall: bool = True) -> PointMap:
     path = np.column_stack([np.full(40, 8.0), np.linspace(0.5, 14.5, 40), np.full(40, height_m)])
     over = (CREST_Z_M + 0.05 - height_m) / (CREST_X_M - 8.0)
     on_wall = np.column_stack([np.full(40, 15.0), path[:, 1], np.full(40, height_m + 7.0 * over)])
-    in_front = np.column_stack([np.full(40, 5.0), path[:, 1], np.full(40, height_m - 3.0)])
+    in_front = np.column_stack([np.full(40, 6.0), path[:, 1], np.full(40, height_m - 6.0)])
     ends = np.concatenate([in_front, on_wall] if beams_to_wall else [in_front, in_front])
     scan = np.tile(np.arange(40), 2)
     return PointMap(
@@ -63,8 +63,18 @@ def test_behind_a_crest_it_is_laid_between_sight_and_the_steepest_fall() -> None
 
 def test_what_lies_in_sight_and_was_only_not_hit_stays_as_it_is() -> None:
     """From high above the crest the sensor's steep beams look behind it."""
-    shadow = laid(X < CREST_X_M, point_map(14.0))
+    shadow = laid(X < CREST_X_M, point_map(14.0, beams_to_wall=False))
     assert (shadow.surface.z_m == carried_on())[Y > 2.0].all()
+
+
+def test_nothing_lies_where_beams_passed() -> None:
+    """Seen from high above nothing is hidden; but what is carried on beyond the crest stands in the way of beams."""
+    shadow = laid(X < CREST_X_M, point_map(14.0))
+    middle, at = np.argmin(np.abs(GRID.y_m - 7.5)), np.argmin(np.abs(GRID.x_m - 12.1))
+    passed = 14.0 + (GRID.x_m[at] - 8.0) * (CREST_Z_M + 0.05 - 14.0) / 3.0
+    assert shadow.surface.z_m[middle, at] < carried_on()[middle, at] - 1.0
+    assert shadow.surface.z_m[middle, at] >= max(passed, CREST_Z_M - STEEPEST_FALL * (GRID.x_m[at] - CREST_X_M)) - 0.15
+    assert not shadow.sigma_m[middle, at]
 
 
 def test_gap_with_seen_places_all_around_stays_as_it_is() -> None:
