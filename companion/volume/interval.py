@@ -145,25 +145,25 @@ def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:
     per_m = roughness(e)
     out = []
     for wanted in (CellState.INTERPOLATED, CellState.UNSEEN):
-        label, n = ndimage.label((state == wanted) & (e.share > 0))
-        if n == 0:
-            out.append(0.0)
-            continue
         reach = per_m * np.minimum(e.surface.gap_m, 10.0)
         if wanted == CellState.UNSEEN:
             reach = np.maximum(3.0 * reach, 0.3 * np.minimum(e.surface.gap_m, 10.0))
         # Outside the pile, too, something may lie where nothing was seen.
         weight = e.grid.cell_area_m2 * e.share * np.where(e.pile, 1.0, 0.5 if wanted == CellState.UNSEEN else 0.1)
-        each = np.bincount(label.ravel(), (reach * weight).ravel(), minlength=n + 1)[1:]
-        out.append(math.sqrt(float(np.sum(each**2))))
+        out.append(_one_error_a_patch((state == wanted) & (e.share > 0), reach * weight))
     return out[0], out[1]
+
+
+def _one_error_a_patch(where: Mask, m3: Array) -> float:
+    """The sum of m3 over each connected patch, in quadrature."""
+    label, n = ndimage.label(where)
+    each = np.bincount(label.ravel(), m3.ravel(), minlength=n + 1)[1:]
+    return math.sqrt(float(np.sum(each**2)))
 
 
 def _shadows(e: Evidence) -> float:
     """What crests hide: one error for each patch."""
-    label, n = ndimage.label(e.hidden_sigma_m > 0)
-    each = np.bincount(label.ravel(), (e.hidden_sigma_m * e.grid.cell_area_m2 * e.share).ravel(), minlength=n + 1)[1:]
-    return math.sqrt(float(np.sum(each**2)))
+    return _one_error_a_patch(e.hidden_sigma_m > 0, e.hidden_sigma_m * e.grid.cell_area_m2 * e.share)
 
 
 def roughness(e: Evidence) -> float:
@@ -185,9 +185,5 @@ def roughness(e: Evidence) -> float:
 def _obstacles(e: Evidence) -> float:
     """Half of what each obstacle's foot would hold at the pile's height there, where one stands in the pile."""
     inside = e.pile & (e.share < 1.0) & (e.depth_m > 2 * e.grid.cell_m)
-    label, n = ndimage.label(inside)
-    if n == 0:
-        return 0.0
     cut = np.where(inside, (1.0 - e.share) * e.grid.cell_area_m2 * np.maximum(e.height_m, 0.0), 0.0)
-    each = np.bincount(label.ravel(), cut.ravel(), minlength=n + 1)[1:]
-    return 0.5 * math.sqrt(float(np.sum(each**2)))
+    return 0.5 * _one_error_a_patch(inside, cut)

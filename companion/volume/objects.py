@@ -92,10 +92,9 @@ def _levelled(grid: Grid, height: Array, covered: Mask, inside: Mask) -> Array:
         around = ndimage.binary_dilation(patch, disc(RIM_CELLS)) & inside & ~covered
         if around.sum() < 3:
             continue
-        design = np.column_stack([np.ones(around.sum()), x[around] - x[patch].mean(), y[around] - y[patch].mean()])
-        plane = np.linalg.lstsq(design, height[around], rcond=None)[0]
-        level = plane[0] + plane[1] * (x - x[patch].mean()) + plane[2] * (y - y[patch].mean())
-        out[patch] = np.minimum(np.maximum(level[patch], min(0.0, float(height[around].min()))), height[around].max())
+        design = np.stack([np.ones(grid.shape), x - x[patch].mean(), y - y[patch].mean()], axis=-1)
+        plane = np.linalg.lstsq(design[around], height[around], rcond=None)[0]
+        out[patch] = np.clip(design[patch] @ plane, min(0.0, float(height[around].min())), height[around].max())
     return out
 
 
