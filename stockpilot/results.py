@@ -77,11 +77,8 @@ def score_flight(
             outcome.truth, world.wall_outlines(), mission.companion.navigator.wall_distance_m
         ),
         "landed_from_start_m": _landed_from_start(outcome),
-        **volume_keys(volume),
+        **volume_scores(volume, truth_volume),
         "odometry_max_gap_s": outcome.odometry_max_gap_s,
-        "truth_volume_m3": truth_volume,
-        "e_v_percent": _error_percent(volume.volume_m3 if volume else None, truth_volume),
-        "truth_in_interval": bool(volume and volume.interval_m3[0] <= truth_volume <= volume.interval_m3[1]),
         "e_p_m": ours.e_p_m,
         "e_p_xy_m": ours.e_p_xy_m,
         "e_z_m": ours.e_z_m,
@@ -103,6 +100,16 @@ def score_flight(
         perfect = _volume_with_perfect_poses(mission, outcome, pin)
         report["e_v_percent_perfect_poses"] = _error_percent(perfect, truth_volume)
     return Scored(report=report, volume=volume, point_map=point_map, pin=pin, paper_path_map_m=paper_path)
+
+
+def volume_scores(volume: VolumeReport | None, truth_m3: float) -> dict[str, Any]:
+    """The report's keys that follow from the measured volume."""
+    return {
+        **volume_keys(volume),
+        "truth_volume_m3": truth_m3,
+        "e_v_percent": _error_percent(volume.volume_m3 if volume else None, truth_m3),
+        "truth_in_interval": bool(volume and volume.interval_m3[0] <= truth_m3 <= volume.interval_m3[1]),
+    }
 
 
 def _score_estimates(outcome: Outcome, pin: MapPin, estimates: list[OdometryEstimate]) -> PoseScore:

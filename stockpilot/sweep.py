@@ -8,8 +8,9 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,8 +22,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from companion.config import Section
 from companion.errors import ConfigError
+from companion.mapping.export import load_point_map, save_point_map
 from stockpilot.files import write_json
 from stockpilot.mission import load_mission
+
+POINT_MAP = "point_map"  # in what comes from a worker, not in the result's file
+Job = Callable[[], dict[str, Any]]
 
 
 class SweepFile(Section):
@@ -100,22 +105,41 @@ def _slug(value: object) -> str:
     return re.sub(r"[^A-Za-z0-9.+-]+", "-", json.dumps(value)).strip("-")[:40]
 
 
-def fly_run(run: SweepRun) -> dict[str, Any]:
-    """One flight, anywhere: its report, its parameters, its path in plan. Runs in a worker."""
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+def fly_run(run: SweepRun, *, keep_map: bool = False) -> dict[str, Any]:
+    """One flight, anywhere: its report, its parameters, its path in plan, its point map if asked. Runs in a worker."""
+    _one_thread()
     from stockpilot.run import fly_lockstep
 
     mission = load_mission(run.mission, run.settings, seed=run.seed)
     flown = fly_lockstep(mission, with_perfect_poses=run.perfect_poses)
     truth = flown.outcome.truth.position_world_m[::25]
     return {
+        **({POINT_MAP: flown.scored.point_map} if keep_map else {}),
         "run": run.name,
         "parameters": dict(run.parameters),
         "report": flown.scored.report,
         "path_world_m": [[round(float(x), 3), round(float(y), 3)] for x, y in truth[:, :2]],
         "outlines_world_m": [[[float(x), float(y)] for x, y in ring] for ring in flown.world.outlines()],
     }
+
+
+def measure_run(run: SweepRun, *, result: dict[str, Any], map_file: Path) -> dict[str, Any]:
+    """The result of a flight with its volume measured anew from the map it left. Runs in a worker."""
+    _one_thread()
+    from companion.volume import estimate_volume
+    from stockpilot.results import volume_scores
+
+    mission = load_mission(run.mission, run.settings, seed=run.seed)
+    report = result["report"]
+    volume = estimate_volume(
+        load_point_map(map_file), mission.companion.volume, is_cut_short=not report.get("lap_closed")
+    )
+    return {**result, "report": {**report, **volume_scores(volume, report["truth_volume_m3"])}}
+
+
+def _one_thread() -> None:
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 def sweep_command(
@@ -134,12 +158,20 @@ def sweep_command(
         int | None,
         typer.Option(min=0, help="fly so many of the missing ones now, spread evenly; 0: only tell what is there"),
     ] = None,
+    keep_maps: Annotated[
+        bool, typer.Option(help="keep each flight's point map beside its result (.ply, some 50 MB each)")
+    ] = False,
+    remeasure: Annotated[
+        bool,
+        typer.Option(help="fly none: measure the volume again, with this version, in the maps that were kept"),
+    ] = False,
     list_only: Annotated[bool, typer.Option("--list", help="name the flights, fly none")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the summary as JSON on stdout")] = False,
 ) -> None:
     """Fly a grid of missions, skip what is there already, and put all results in one table and one page.
 
-    A sweep that was stopped goes on where it was: start the same command again.
+    A sweep that was stopped goes on where it was: start the same command again. To try the volume's own code or its
+    interval on all flights of a sweep without flying them again: --keep-maps while flying, then --remeasure.
     """
     from stockpilot.sweep_report import fill_document, summarise, write_sweep_report
 
@@ -153,18 +185,24 @@ def sweep_command(
     folder.mkdir(parents=True, exist_ok=True)
     done = read_results(folder, runs)
     console = Console(stderr=True)
-    missing = spread([run for run in runs if run.name not in done], limit)
     if done:
         console.print(f"{len(done)} of {len(runs)} flights are there already")
+    if remeasure:
+        jobs = _to_measure(folder, [run for run in runs if run.name in done], done)
+    else:
+        missing = spread([run for run in runs if run.name not in done], limit)
+        jobs = {run: partial(fly_run, run, keep_map=keep_maps) for run in missing}
     failed: dict[str, str] = {}
-    if missing:
-        for run, result in _fly_all(missing, scheduler, workers, console):
-            if isinstance(result, dict):
-                write_json(folder / f"{run.name}.json", result)
-                done[run.name] = result
-            else:
-                failed[run.name] = str(result)
-                console.print(f"[red]{run.name}: {result}[/]")
+    for run, result in _compute_all(jobs, scheduler, workers, console) if jobs else ():
+        if isinstance(result, dict):
+            point_map = result.pop(POINT_MAP, None)
+            if point_map is not None:
+                save_point_map(point_map, _map_file(folder, run))
+            write_json(folder / f"{run.name}.json", result)
+            done[run.name] = result
+        else:
+            failed[run.name] = str(result)
+            console.print(f"[red]{run.name}: {result}[/]")
     results = [done[run.name] for run in runs if run.name in done]
     if not results:
         raise ConfigError(f"{sweep_file}: no flight gave a result: {next(iter(failed.values()), 'nothing to fly')}")
@@ -204,8 +242,26 @@ def read_results(folder: Path, runs: Iterable[SweepRun]) -> dict[str, dict[str, 
     return out
 
 
-def _fly_all(
-    runs: Sequence[SweepRun], scheduler: str | None, workers: int | None, console: Console
+def _map_file(folder: Path, run: SweepRun) -> Path:
+    return folder / f"{run.name}.ply"
+
+
+def _to_measure(folder: Path, flown: Sequence[SweepRun], done: Mapping[str, dict[str, Any]]) -> dict[SweepRun, Job]:
+    """Raises: ConfigError: a flight left no map: a table of two versions would be worse than none."""
+    without = [run.name for run in flown if not _map_file(folder, run).is_file()]
+    if without or not flown:
+        raise ConfigError(
+            f"{folder}: {len(without)} of {len(flown)} flights left no point map, {next(iter(without), 'nothing flown')}: "
+            "fly them with --keep-maps first"
+        )
+    return {
+        run: partial(measure_run, run, result=done[run.name], map_file=_map_file(folder, run).resolve())
+        for run in flown
+    }
+
+
+def _compute_all(
+    jobs: Mapping[SweepRun, Job], scheduler: str | None, workers: int | None, console: Console
 ) -> Iterator[tuple[SweepRun, dict[str, Any] | Exception]]:
     from dask.distributed import Client, LocalCluster, as_completed
 
@@ -215,9 +271,9 @@ def _fly_all(
     )  # fmt: skip
     cluster = None
     if scheduler is None:
-        count = min(workers or os.cpu_count() or 1, len(runs))
+        count = min(workers or os.cpu_count() or 1, len(jobs))
         cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1",
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", host="127.0.0.1",
             memory_limit=0, silence_logs=40,
         )  # fmt: skip
     try:
@@ -225,8 +281,8 @@ def _fly_all(
             Client(cluster if cluster is not None else scheduler) as client,
             Progress(*columns, console=console) as bar,
         ):
-            task = bar.add_task("flights", total=len(runs))
-            futures = {client.submit(fly_run, run, key=run.name, pure=False, retries=2): run for run in runs}
+            task = bar.add_task("flights", total=len(jobs))
+            futures = {client.submit(job, key=run.name, pure=False, retries=2): run for run, job in jobs.items()}
             for future in as_completed(list(futures)):
                 run = futures.pop(future)
                 error = future.exception()

@@ -6,8 +6,9 @@ import base64
 import html
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,16 @@ def is_confident_and_wrong(report: dict[str, Any]) -> bool:
     return report.get("volume_m3") is not None and not report.get("truth_in_interval") and not report.get("warnings")
 
 
+def _interval_scores(report: dict[str, Any]) -> dict[str, float]:
+    """How wide the interval is and how far the error fills it; nothing where it has no upper end."""
+    _, high = report.get("volume_interval_m3") or (None, None)
+    volume, truth = report.get("volume_m3"), report.get("truth_volume_m3")
+    if high is None or volume is None or not truth or not high > volume:
+        return {}
+    sigma = (high - volume) / NormalDist().inv_cdf(0.5 + (report.get("volume_interval_level") or 0.95) / 2)
+    return {"half_width_percent": 100.0 * (high - volume) / truth, "error_over_sigma": (volume - truth) / sigma}
+
+
 def summarise(results: Sequence[Result]) -> dict[str, Any]:
     """The figures that the targets speak of, over all flights."""
     reports = [result["report"] for result in results]
@@ -81,6 +92,8 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
         "abs_e_v_percent_max": _max(e_v),
         "abs_e_v_percent_perfect_poses_median": _median(np.abs(_numbers(reports, "e_v_percent_perfect_poses"))),
         "truth_in_interval_ratio": float(np.mean([bool(r.get("truth_in_interval")) for r in reports])),
+        "interval_half_width_percent_median": _median(_numbers(map(_interval_scores, reports), "half_width_percent")),
+        "error_over_sigma_rms": _rms(_numbers(map(_interval_scores, reports), "error_over_sigma")),
         "outside_without_warning": sum(is_confident_and_wrong(report) for report in reports),
         "c_c_per_keyframe": float(c_c.sum() / keyframes.sum()) if keyframes.sum() else None,
         "paper_e_p_m_median": _median(_numbers(paper, "e_p_m")),
@@ -171,7 +184,9 @@ def fill_document(path: Path, name: str, results: Sequence[Result], *, command: 
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _numbers(rows: Sequence[dict[str, Any]], key: str, *, keep: bool = False) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _numbers(
+    rows: Iterable[Mapping[str, Any]], key: str, *, keep: bool = False
+) -> np.ndarray[Any, np.dtype[np.float64]]:
     values = [row.get(key) for row in rows]
     if keep:
         return np.array([math.nan if v is None else float(v) for v in values])
@@ -188,6 +203,10 @@ def _min(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
 
 def _max(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
     return float(np.max(values)) if len(values) else None
+
+
+def _rms(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def _short(value: Any) -> str:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import socket
-import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 import numpy as np
 
 from simbridge.autopilot import Autopilot
 from simbridge.sensors import BaroSample, ImuSample
 from simbridge.sitl.parameters import PX4_VISION
+from tests.stockpilot.background import Background
 
 STEP_NS = 4_000_000
 MAX_BEHIND_S = 0.5
@@ -24,11 +23,12 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-class Standing:
+class Standing(Background):
     """A context: inside it, the autopilot sends to `ground_url` as PX4 does to 14550. alter: what becomes of each frame
     on its way to the ground; None: lost."""
 
     def __init__(self, **params: float) -> None:
+        super().__init__()
         self.autopilot = Autopilot({**PX4_VISION, **params})
         self.port = free_port()
         self.ground_url = f"udpin://127.0.0.1:{self.port}"
@@ -36,18 +36,8 @@ class Standing:
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
         self.alter: Callable[[bytes], bytes | None] = lambda frame: frame
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> Standing:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join(5)
+    def _close(self) -> None:
         self._socket.close()
 
     def _run(self) -> None:

@@ -4,23 +4,23 @@ serves it (LOG_REQUEST_LIST, LOG_REQUEST_DATA in pieces of 90 bytes), on a link 
 from __future__ import annotations
 
 import socket
-import threading
 import time
-from types import TracebackType
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as m
 
+from tests.stockpilot.background import Background
 from tests.stockpilot.emulated import free_port
 
 PIECE = 90
 BURST = 50  # pieces between two looks at what was asked
 
 
-class LogKeeper:
+class LogKeeper(Background):
     """A context. logs: content by number. lost_every: each so many pieces of data one is lost, once."""
 
     def __init__(self, logs: dict[int, bytes], *, lost_every: int = 0) -> None:
+        super().__init__()
         self.logs, self.lost_every = logs, lost_every
         self.port = free_port()
         self.ground_url = f"udpin://127.0.0.1:{self.port}"
@@ -32,18 +32,8 @@ class LogKeeper:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.02)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def __enter__(self) -> LogKeeper:
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join(5)
+    def _close(self) -> None:
         self._socket.close()
 
     def _say(self, message: Any) -> None:

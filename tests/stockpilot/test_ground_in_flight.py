@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Callable, Iterator
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -22,6 +20,7 @@ from stockpilot.lockstep import Lockstep
 from stockpilot.run import emulated
 from stockpilot.wires import OFFBOARD
 from tests.flights import small_mission
+from tests.stockpilot.background import Background
 from tests.stockpilot.emulated import free_port
 
 pytestmark = pytest.mark.xdist_group("flight")
@@ -52,11 +51,12 @@ class TwoLinks:
             self._autopilot.receive(OFFBOARD, frame, t_ns)
 
 
-class Flying:
+class Flying(Background):
     """A context: inside it the small hall is being flown, in a thread and not faster than real time, from the moment
     the companion looks for a wall."""
 
     def __init__(self) -> None:
+        super().__init__()
         mission = small_mission()
         assert mission.sim is not None
         port = free_port()
@@ -65,30 +65,23 @@ class Flying:
         self.simulation, autopilot = emulated(mission.sim, (OFFBOARD, "gcs"))
         self.wire = TwoLinks(autopilot, self._link)
         self.flight = Flight(config=mission.companion, lidar_metadata_json=self.simulation.lidar_metadata_json())
-        self._run = Lockstep(simulation=self.simulation, wire=self.wire, flight=self.flight, keep_scans=False)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._go_on, daemon=True)
+        self._lockstep = Lockstep(simulation=self.simulation, wire=self.wire, flight=self.flight, keep_scans=False)
         self.fault: BaseException | None = None
 
-    def __enter__(self) -> Flying:
+    def __enter__(self) -> Self:
         while self.state is not NavigatorState.FIND_WALL:
-            self._run.step()
+            self._lockstep.step()
             assert self.simulation.t_ns < 120e9
-        self._thread.start()
-        return self
+        return super().__enter__()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop.set()
-        self._thread.join(10)
+    def _close(self) -> None:
         self._link.close()
 
-    def _go_on(self) -> None:
+    def _run(self) -> None:
         pace = Pace(1.0)
         try:
             while not self._stop.is_set():
-                self._run.step()
+                self._lockstep.step()
                 pace.wait(self.simulation.t_ns)
         except BaseException as error:  # told to the test
             self.fault = error

@@ -8,9 +8,14 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from companion.errors import ConfigError
-from stockpilot.sweep import SweepRun, load_sweep, read_results, spread
+from companion.mapping.export import save_point_map
+from companion.volume import estimate_volume
+from stockpilot.mission import load_mission
+from stockpilot.sweep import SweepRun, load_sweep, read_results, spread, sweep_command
 from stockpilot.sweep_report import (
     fill_document,
     flat_row,
@@ -19,6 +24,7 @@ from stockpilot.sweep_report import (
     trends,
     write_sweep_report,
 )
+from tests.companion.volume.synthetic import Flight, Hall, cone, make_map, rectangle
 
 MISSIONS = Path(__file__).resolve().parents[2] / "missions"
 SWEEPS = [MISSIONS / "paper_sweep.yaml", *sorted((MISSIONS / "sweeps").glob("*.yaml"))]
@@ -142,6 +148,47 @@ def test_flight_that_is_there_is_skipped_and_half_a_file_is_flown_again(tmp_path
     (tmp_path / "a.json").write_text(json.dumps({"report": {}}), encoding="utf-8")
     (tmp_path / "b.json").write_text('{"report": {', encoding="utf-8")
     assert set(read_results(tmp_path, runs)) == {"a"}
+
+
+def test_volume_is_measured_again_in_the_maps_that_were_kept(tmp_path: Path) -> None:
+    """As a flight's own measuring would: to the last bit, and nothing else of the result changes."""
+    sweep_file = tmp_path / "sweep.yaml"
+    sweep_file.write_text(f"missions: [{MISSIONS / 'cement_store.yaml'}]\nseeds: [3]\n", encoding="utf-8")
+    _, runs = load_sweep(sweep_file)
+    made = make_map(Hall(footprint=rectangle(24.0, 20.0), pile=cone(12.0, 10.0, 3.0, 0.7)), Flight(height_m=6.0), 1)
+    stale = result(runs[0].name, speed=0.43, seed=3, e_p=0.01, e_v=9.0, keyframes=40, lap_closed=True)
+    stale["report"]["truth_volume_m3"] = made.true_volume_m3
+    file = tmp_path / f"{runs[0].name}.json"
+    file.write_text(json.dumps(stale), encoding="utf-8")
+
+    app = typer.Typer()
+    app.command()(sweep_command)
+    command = [str(sweep_file), "--out", str(tmp_path), "--remeasure", "--workers", "1", "--json"]
+    with pytest.raises(ConfigError, match="--keep-maps"):
+        CliRunner().invoke(app, command, catch_exceptions=False)
+
+    save_point_map(made.point_map, tmp_path / f"{runs[0].name}.ply")
+    told = CliRunner().invoke(app, command)
+    assert told.exit_code == 0, told.output
+    again = json.loads(file.read_text(encoding="utf-8"))
+    volume = estimate_volume(made.point_map, load_mission(Path(runs[0].mission), (), seed=3).companion.volume)
+    assert again["report"]["volume_m3"] == volume.volume_m3
+    assert again["report"]["volume_interval_m3"] == list(volume.interval_m3)
+    assert abs(again["report"]["e_v_percent"]) < 2.0
+    assert (again["path_world_m"], again["report"]["e_p_m"]) == (stale["path_world_m"], 0.01)
+
+
+def test_how_wide_the_interval_is_and_how_full_is_told() -> None:
+    results = [result("a", speed=0.3, seed=0, e_p=0.1, e_v=e_v, keyframes=10) for e_v in (0.5, -0.5)]
+    for each in results:
+        volume = each["report"]["volume_m3"]
+        each["report"]["volume_interval_m3"] = [volume - 19.6, volume + 19.6]
+        each["report"]["volume_interval_level"] = 0.95
+        each["report"]["truth_volume_m3"] = volume - 5.0
+    no_end = result("b", speed=0.3, seed=0, e_p=0.1, e_v=1.0, keyframes=10, volume_interval_m3=[900.0, None])
+    told = summarise([*results, no_end])
+    assert told["error_over_sigma_rms"] == pytest.approx(0.5, rel=1e-3)
+    assert told["interval_half_width_percent_median"] == pytest.approx(1.96, rel=0.02)
 
 
 def test_row_is_flat() -> None:
