@@ -279,7 +279,7 @@ def _compute_all(
     try:
         with (
             Client(cluster if cluster is not None else scheduler) as client,
-            Progress(*columns, console=console) as bar,
+            Progress(*columns, console=console, refresh_per_second=1) as bar,
         ):
             task = bar.add_task("flights", total=len(jobs))
             futures = {client.submit(job, key=run.name, pure=False, retries=2): run for run, job in jobs.items()}

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink import mavutil
 
 from companion.messages import RequestKind
 from stockpilot.leave import write_results
 from stockpilot.lockstep import Lockstep
 from stockpilot.mission import Mission
+from stockpilot.recorded import LockstepRecorder
 from stockpilot.run import Flown, fly_lockstep, prepare
 from tests.flights import small_mission
 
@@ -26,8 +29,15 @@ pytestmark = pytest.mark.xdist_group("flight")
 
 
 @pytest.fixture(scope="module")
-def flown() -> Flown:
-    return fly_lockstep(small_mission(), with_perfect_poses=True)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("flown")
+
+
+@pytest.fixture(scope="module")
+def flown(folder: Path) -> Flown:
+    mission = small_mission()
+    with LockstepRecorder(folder, mission, "emulated") as recorder:
+        return fly_lockstep(mission, with_perfect_poses=True, attach=recorder.attach)
 
 
 @pytest.mark.timeout(300)
@@ -80,6 +90,20 @@ def test_results_are_written_whole(flown: Flown, tmp_path: Path) -> None:
     assert tum.shape[1] == 8
     assert np.all(np.diff(tum[:, 0]) > 0)
     np.testing.assert_allclose(np.linalg.norm(tum[:, 4:], axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.timeout(300)
+def test_qgroundcontrol_can_draw_track_and_height_from_the_tlog(flown: Flown, folder: Path) -> None:
+    """It takes both from GLOBAL_POSITION_INT alone, and the vehicle's kind from its first HEARTBEAT."""
+    log = mavutil.mavlink_connection(str(folder / "telemetry.tlog"))
+    heard = list(iter(partial(log.recv_match, type=["HEARTBEAT", "GLOBAL_POSITION_INT"]), None))
+    vehicle = [m for m in heard if m.get_srcComponent() == 1]
+    assert (vehicle[0].get_type(), vehicle[0].autopilot) == ("HEARTBEAT", 12)
+    places = [m for m in vehicle if m.get_type() == "GLOBAL_POSITION_INT"]
+    assert max(m.relative_alt for m in places) == pytest.approx(4500, abs=300)
+    north_m = np.ptp([m.lat for m in places]) * 1e-7 * 111_320
+    assert 7 < north_m < 17  # of a hall of 17 m by 22 m, flown round 5 m off its walls
+    assert len(places) == pytest.approx(2.0 * flown.outcome.simulated_s, rel=0.2)
 
 
 def crossed(mission: Mission, steps: int) -> str:

@@ -109,7 +109,7 @@ def test_a_refused_stream_is_told_and_does_not_stop_the_others() -> None:
     peer.run(2.0)
     told = [event.text for event in peer.events if event.name == "stream_refused"]
     assert "Stream LOCAL_POSITION_NED at 10 Hz: denied" in told
-    assert len(told) == 8
+    assert len(told) == len(ARDUPILOT.streams_hz)
 
 
 # ---- origin ---------------------------------------------------------------------------------------------------------
