@@ -93,17 +93,23 @@ def test_results_are_written_whole(flown: Flown, tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-def test_qgroundcontrol_can_draw_track_and_height_from_the_tlog(flown: Flown, folder: Path) -> None:
-    """It takes both from GLOBAL_POSITION_INT alone, and the vehicle's kind from its first HEARTBEAT."""
+def test_qgroundcontrol_can_draw_track_height_and_speed_from_the_tlog(flown: Flown, folder: Path) -> None:
+    """It takes the vehicle's kind from its first HEARTBEAT, its place from GLOBAL_POSITION_INT, its speed from VFR_HUD,
+    and its height from ALTITUDE for good once it has seen one."""
     log = mavutil.mavlink_connection(str(folder / "telemetry.tlog"))
-    heard = list(iter(partial(log.recv_match, type=["HEARTBEAT", "GLOBAL_POSITION_INT"]), None))
+    wanted = ["HEARTBEAT", "GLOBAL_POSITION_INT", "VFR_HUD", "ALTITUDE"]
+    heard = list(iter(partial(log.recv_match, type=wanted), None))
     vehicle = [m for m in heard if m.get_srcComponent() == 1]
-    assert (vehicle[0].get_type(), vehicle[0].autopilot) == ("HEARTBEAT", 12)
+    assert next(m for m in vehicle if m.get_type() == "HEARTBEAT").autopilot == 12
     places = [m for m in vehicle if m.get_type() == "GLOBAL_POSITION_INT"]
     assert max(m.relative_alt for m in places) == pytest.approx(4500, abs=300)
     north_m = np.ptp([m.lat for m in places]) * 1e-7 * 111_320
     assert 7 < north_m < 17  # of a hall of 17 m by 22 m, flown round 5 m off its walls
     assert len(places) == pytest.approx(2.0 * flown.outcome.simulated_s, rel=0.2)
+    heights = [m.altitude_relative for m in vehicle if m.get_type() == "ALTITUDE"]
+    assert max(heights) == pytest.approx(4.5, abs=0.3)
+    assert heights[-1] == pytest.approx(0.0, abs=0.3), "to the end, landed"
+    assert max(m.groundspeed for m in vehicle if m.get_type() == "VFR_HUD") == pytest.approx(0.8, abs=0.3)
 
 
 def crossed(mission: Mission, steps: int) -> str:

@@ -54,7 +54,8 @@ ARDUPILOT = Dialect(
         (wire.SYS_STATUS, 1.0),
         (wire.BATTERY_STATUS, 1.0),
         (wire.GPS_GLOBAL_ORIGIN, 0.2),
-        (wire.GLOBAL_POSITION_INT, 2.0),  # for the .tlog's reader, as with PX4
+        (wire.GLOBAL_POSITION_INT, 2.0),  # for the .tlog's reader, as with PX4; it has no ALTITUDE
+        (wire.VFR_HUD, 2.0),
     ),
     max_round_trip_ns=50_000_000,  # it answers between its tasks: 3 to 21 ms in the recordings; the quickest counts
     timesync_answers=0,  # corrects for jitter itself

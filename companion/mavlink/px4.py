@@ -70,10 +70,14 @@ PX4 = Dialect(
         (wire.CURRENT_MODE, 2.0),
         (wire.SYS_STATUS, 1.0),
         (wire.BATTERY_STATUS, 1.0),
-        (wire.GLOBAL_POSITION_INT, 2.0),  # QGroundControl draws the track and the height of a .tlog from it alone
-        # not used: ATTITUDE, SERVO_OUTPUT_RAW, VFR_HUD, ATTITUDE_TARGET, POSITION_TARGET_LOCAL_NED, HIGHRES_IMU,
-        # ALTITUDE, VIBRATION, ESC_INFO, ESC_STATUS, ODOMETRY
-        *((unused, 0.0) for unused in (30, 36, 74, 83, 85, 105, 141, 241, 290, 291, wire.ODOMETRY)),
+        # For the .tlog's reader: QGroundControl draws place, speed and height from these alone. One ALTITUDE makes it
+        # deaf to any other height, so that it must not end.
+        (wire.GLOBAL_POSITION_INT, 2.0),
+        (wire.VFR_HUD, 2.0),
+        (wire.ALTITUDE, 2.0),
+        # not used: ATTITUDE, SERVO_OUTPUT_RAW, ATTITUDE_TARGET, POSITION_TARGET_LOCAL_NED, HIGHRES_IMU, VIBRATION,
+        # ESC_INFO, ESC_STATUS, ODOMETRY
+        *((unused, 0.0) for unused in (30, 36, 83, 85, 105, 241, 290, 291, wire.ODOMETRY)),
     ),
     max_round_trip_ns=10_000_000,  # lib/timesync: MAX_RTT_SAMPLE
     timesync_answers=500,  # lib/timesync: CONVERGENCE_WINDOW

@@ -8,6 +8,7 @@ import numpy as np
 
 from companion.messages import Array
 from companion.volume.grid import Index
+from companion.volume.keyframes import LEAST_KEYFRAMES, disagreement
 from companion.volume.polygon import signed_area, simplify_closed
 
 BULGE_M = 4.0  # walls bulge over about so many metres
@@ -137,17 +138,20 @@ def _join(before: EdgeFit | None, after: EdgeFit | None, corner: Array) -> list[
     return [line.point + ((corner - line.point) @ line.direction) * line.direction for line in (before, after)]
 
 
-def pose_disagreement(fits: list[EdgeFit], points: Array, keyframe: Index) -> float:
-    """How far the keyframes disagree on where a wall is, 1 sigma: their own mean offsets, less what noise explains."""
-    total, weight = 0.0, 0.0
+def pose_disagreement(fits: list[EdgeFit], keyframe: Index) -> tuple[float, float]:
+    """How far the keyframes disagree on where a wall is: single ones, and all together. NaN where too few see any."""
+    single2, lap2, weight = 0.0, 0.0, 0.0
     for fit in fits:
-        ids, index = np.unique(keyframe[fit.members], return_inverse=True)
+        _, index = np.unique(keyframe[fit.members], return_inverse=True)
         n = np.bincount(index)
         seen = n >= 8
-        if len(ids) < 3 or seen.sum() < 3:
+        if seen.sum() < LEAST_KEYFRAMES:
             continue
         means = np.bincount(index, fit.offsets_m)[seen] / n[seen]
-        spread = float(np.median(np.abs(means - np.median(means))) * 1.4826) ** 2
-        total += float(seen.sum()) * max(spread - float(np.mean(fit.noise_m**2 / n[seen])), 0.0)
+        single, lap = disagreement(means, float(np.mean(fit.noise_m**2 / n[seen])))
+        single2 += float(seen.sum()) * single**2
+        lap2 += float(seen.sum()) * lap**2
         weight += float(seen.sum())
-    return float(np.sqrt(total / weight)) if weight else 0.0
+    if not weight:
+        return float("nan"), float("nan")
+    return float(np.sqrt(single2 / weight)), float(np.sqrt(lap2 / weight))

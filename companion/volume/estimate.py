@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,10 @@ from companion.messages import Array, PointMap, VolumeReport
 from companion.volume.beams import where_beams_meet
 from companion.volume.contact import Contact, fit_contact
 from companion.volume.doubt import doubt
-from companion.volume.floor import Floor, fit_floor, level_floor
+from companion.volume.floor import Floor, fit_floor, floor_beside, level_floor
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc, grid_around
-from companion.volume.interval import Evidence, error_budget, interval
+from companion.volume.interval import RIM_M, Evidence, error_budget, interval
+from companion.volume.keyframes import DRIFTS, LEAST_KEYFRAMES, disagreement, untold_turn
 from companion.volume.objects import find_objects
 from companion.volume.shadow import Shadow, lay_hidden
 from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells, without_strays
@@ -25,11 +27,10 @@ INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called in
 
 LEAST_PILE_M = 0.12  # that a heap rises to
 LEAST_FOOT_M = 0.03
-RIM_M = 1.5  # of floor, around the material
-LEAST_KEYFRAMES = 6  # that see the floor, before their disagreement on it is judged
 LEAST_FROM_ABOVE = 0.3  # of the map's points
 BESIDE_WALLS_M = 1.0  # beyond the strip
 SLIVERS_M = 0.5  # the same
+LEAST_WALL_SIGMA_M = 0.003  # of a wall's place, however straight its returns lie
 
 
 def estimate_volume(
@@ -134,11 +135,11 @@ def _report(
         warnings=(*footprint.warnings, *objects.warnings),
     )
     pile = pile_mask(height, footprint.share > 0, cells, floor, grid)
+    rise, rise_sigma = floor_beside(grid, floor, height, pile)
+    height, floor_z = height - rise, floor_z + rise
     area = grid.cell_area_m2 * footprint.share
     volume = float(np.sum((height * area)[pile]))
-    position_sigma = max(point_map.position_sigma_m, footprint.pose_sigma_m)
-    # A rise of the whole map changes no volume: where the keyframes' own disagreement is seen, it is what counts.
-    disagreement = keyframe_height_sigma(point_map, cells, floor)
+    seen_by_all = floor_disagreement(point_map, cells, floor)
     evidence = Evidence(
         grid=grid,
         cells=cells,
@@ -146,18 +147,18 @@ def _report(
         hidden_sigma_m=shadow.sigma_m,
         contact=contact,
         floor=floor,
+        rise_sigma_m=rise_sigma,
         height_m=height,
         share=footprint.share,
         pile=pile,
         depth_m=footprint.depth_m,
         has_walls=footprint.has_walls,
-        keyframes=len(np.unique(point_map.keyframe_id)),
         range_offset_sigma_m=cfg.range_offset_sigma_m,
         told_sigma_m=point_map.position_sigma_m,
-        position_sigma_m=position_sigma,
-        height_sigma_m=point_map.height_sigma_m if disagreement is None else disagreement,
-        floor_disagreement_m=disagreement or 0.0,
-        wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, 0.005)) if footprint.has_walls else 0.0,
+        position_sigma_m=_position_sigma(point_map, footprint, grid, area * pile),
+        height_sigma_m=point_map.height_sigma_m / math.sqrt(DRIFTS) if seen_by_all is None else seen_by_all[1],
+        floor_disagreement_m=0.0 if seen_by_all is None else seen_by_all[0],
+        wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, LEAST_WALL_SIGMA_M)) if footprint.has_walls else 0.0,
     )
     total = float(area.sum())
     ratio = {s: float(area[surface.state == s].sum()) / total for s in CellState}
@@ -217,8 +218,9 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, floor: Floor, grid: Gri
     return np.asarray(ndimage.binary_dilation(core, disc(cells_of(RIM_M, grid))) & inside)
 
 
-def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> float | None:
-    """How far the keyframes disagree on the floor's height, 1 sigma, but for what noise may hide; None: too few see it."""
+def floor_disagreement(point_map: PointMap, cells: Cells, floor: Floor) -> tuple[float, float] | None:
+    """How far single keyframes disagree on the floor's height, and what that leaves of a lap, 1 sigma; None: too few see
+    it. A rise of the whole map changes no volume."""
     on_floor = cells.of_point >= 0
     on_floor[on_floor] = floor.cells.ravel()[cells.of_point[on_floor]]
     index = np.flatnonzero(on_floor)
@@ -232,10 +234,23 @@ def keyframe_height_sigma(point_map: PointMap, cells: Cells, floor: Floor) -> fl
     if seen.sum() < LEAST_KEYFRAMES:
         return None
     means = np.bincount(of_keyframe, r)[seen] / n[seen]
-    spread = (1.4826 * float(np.median(np.abs(means - np.median(means))))) ** 2
-    # No less than what noise could hide.
-    explained = float(np.mean(np.var(r) / n[seen]))
-    return float(np.sqrt(max(spread - explained, explained)))
+    return disagreement(means, float(np.mean(np.var(r) / n[seen])))
+
+
+def _position_sigma(point_map: PointMap, footprint: Footprint, grid: Grid, pile_m2: Array) -> float:
+    """What is left of the poses' error in plan over a lap. A shift of the whole map changes no volume: what counts is how
+    far the keyframes disagree on the walls, and in round halls the turns that walls do not show."""
+    told = point_map.position_sigma_m / math.sqrt(DRIFTS)
+    if not np.isfinite(footprint.lap_sigma_m):
+        return told
+    unseen = untold_turn(footprint.polygon_m)
+    if unseen > 0.0 and len(point_map.path_map):
+        x, y = grid.centres()
+        middle = footprint.polygon_m.mean(axis=0)
+        flown = float(np.mean(np.sum((point_map.path_map[:, :2] - middle) ** 2, axis=1)))
+        away = float(np.sum(pile_m2 * ((x - middle[0]) ** 2 + (y - middle[1]) ** 2))) / max(float(pile_m2.sum()), 1e-9)
+        unseen *= math.sqrt(min(away / max(flown, 1e-9), 1.0))  # a turn about the middle moves less what is near it
+    return math.hypot(footprint.lap_sigma_m, unseen * told)
 
 
 def _nothing(cfg: VolumeConfig, why: str) -> VolumeReport:

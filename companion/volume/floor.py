@@ -15,6 +15,8 @@ TRIALS = 500
 LEAST_CELLS = 50  # of bare floor, away from all that rises
 SURE_SHARE = 0.1  # of all cells, on one plane
 BENT_M = 0.1  # what a floor departs from its plane by, where the attitude that mapped it was off
+FROM_M, TO_M = 1.0, 3.0  # beyond a pile's rim: floor that tells how high it lies beneath; nearer its foot may run out
+LEAST_IN_BLOCK, LEAST_BLOCKS, LEAST_AROUND = 6, 4, 6
 BLOCK_M = 3.0  # floors undulate over a few metres: residuals are judged in blocks of this size
 
 
@@ -95,6 +97,41 @@ def level_floor(grid: Grid, z_m: float) -> Floor:
     )
 
 
+def floor_beside(grid: Grid, floor: Floor, height: Array, pile: Mask) -> tuple[Array, Array]:
+    """How far the floor under each pile lies above the plane, as the floor around it tells, and its 1 sigma.
+
+    Floors undulate, and a map whose attitude drifted is bent: what lies about a pile was seen by the same scans as the
+    pile, so its departure is the pile's own. The sigma is NaN where too little floor lies around: the plane has to do.
+
+    Args: height: (ny, nx) of the surface above the plane. pile: (ny, nx), with its rim of floor.
+    Returns: (ny, nx) each, in m; zero and NaN outside the piles.
+    """
+    label, n = ndimage.label(pile)
+    near = ndimage.binary_dilation(pile, disc(cells_of(FROM_M, grid)))
+    rise, sigma = np.zeros(grid.shape), np.full(grid.shape, np.nan)
+    block = cells_of(BLOCK_M, grid)
+    row_at, column_at = np.indices(grid.shape).astype(np.float64)
+    row, column = np.indices(grid.shape) // block
+    for k in range(1, n + 1):
+        own = label == k
+        ring = ndimage.binary_dilation(own, disc(cells_of(TO_M, grid))) & ~near & floor.cells
+        _, of_block = np.unique(row[ring] * (column.max() + 1) + column[ring], return_inverse=True)
+        count = np.bincount(of_block)
+        full = count >= LEAST_IN_BLOCK
+        if full.sum() < LEAST_AROUND:
+            continue
+        means, *at = ((np.bincount(of_block, v[ring]) / count)[full] for v in (height, row_at, column_at))
+        # Where it leans, the middle is still its mean: what counts is how far it departs from a plane.
+        design = np.column_stack([np.ones(len(means)), *at])
+        left = means - design @ np.linalg.lstsq(design, means, rcond=None)[0]
+        error2 = float(np.sum(left**2)) / (len(means) - 3) / len(means)
+        # As far as it stands out from what a ring tells by chance.
+        trust = floor.undulation_m**2 / max(floor.undulation_m**2 + error2, 1e-12)
+        rise[own] = trust * float(np.mean(height[ring]))
+        sigma[own] = np.sqrt(error2)
+    return rise, sigma
+
+
 def _lowest_plane(design: Array, z: Array, tolerance: float) -> Array:
     """The plane with the most cells upon it and the fewest beneath it (a pile's flat top has many beneath)."""
     rng = np.random.default_rng(0)
@@ -159,10 +196,10 @@ def _judged(
     block = np.floor(d[:, 1:] / BLOCK_M).astype(np.int64)
     _, of_block = np.unique(block, axis=0, return_inverse=True)
     n = np.bincount(of_block) if len(r) else np.zeros(0)
-    full = n >= 6
+    full = n >= LEAST_IN_BLOCK
     covariance: Array = np.eye(3)
     undulation = 0.1
-    if full.sum() >= 4:
+    if full.sum() >= LEAST_BLOCKS:
         means = (np.bincount(of_block, r) / n)[full]
         undulation = float(np.sqrt(max(float(np.var(means)) - float(np.mean(residual**2 / n[full])), 0.0)))
         rows = np.column_stack([np.bincount(of_block, d[:, i]) / n for i in range(3)])[full]
@@ -176,5 +213,5 @@ def _judged(
         cells=cells,
         undulation_m=undulation,
         residual_m=residual,
-        found=bool(full.sum() >= 4),
+        found=bool(full.sum() >= LEAST_BLOCKS),
     )

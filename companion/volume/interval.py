@@ -16,14 +16,16 @@ from scipy import ndimage
 from companion.messages import Array
 from companion.volume.contact import Contact
 from companion.volume.floor import BLOCK_M, Floor
-from companion.volume.grid import Grid, Mask
+from companion.volume.grid import Grid, Mask, cells_of, disc
+from companion.volume.keyframes import DRIFTS
 from companion.volume.surface import Cells, CellState, Surface
 
-POSES_ALIKE = 6.0  # keyframes in a row that share most of their error
-LEAST_ERRORS = 3.0  # independent ones that a lap's poses average over, however short it was
 LEAST_FLOOR_CELLS = 50
-THIN_M, THIN_REACH_M = 0.003, 2.0  # of loose material that lies about a heap
-SHARED_WITH_FLOOR = 0.5  # of an error in height: the same scans see the floor, from which the material is counted
+RIM_M = 1.5  # of floor, around the material
+THIN_M, THIN_REACH_M = 0.001, 2.0  # of loose material that lies about a heap, beyond its rim
+BELL = 1.0 / 6.0  # of the height where the rim begins: what a bell-shaped foot leaves beyond it, in the mean
+GAP_M = 4.0  # seen cells so far apart on a gap's rim err on their own
+BESIDE_FLOOR = 0.2  # of an error in height is left where the same scans see the floor around
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,12 +38,12 @@ class Evidence:
     hidden_sigma_m: Array
     contact: Contact
     floor: Floor
+    rise_sigma_m: Array
     height_m: Array
     share: Array
     pile: Mask
     depth_m: Array
     has_walls: bool
-    keyframes: int
     range_offset_sigma_m: float
     told_sigma_m: float
     position_sigma_m: float
@@ -57,17 +59,13 @@ def error_budget(e: Evidence) -> dict[str, float]:
     flanks = _flanks(e, area)
     flank = math.sqrt(sum(f * f for f in flanks))
     gaps, hidden = _interpolation(e, area)
-    # What the keyframes disagree by beyond what registration tells of itself is drift: a whole side shares it.
-    drift_m = math.sqrt(max(e.position_sigma_m**2 - e.told_sigma_m**2, 0.0))
-    averaged = math.sqrt(max(LEAST_ERRORS, e.keyframes / POSES_ALIKE))
     return {
         "returns": _sampling(e, area),
-        "position": flank * math.hypot(e.told_sigma_m / averaged, drift_m / math.sqrt(LEAST_ERRORS)),
-        # Heights drift with the tilt, which rough walls tell badly: a whole side shares it, however many keyframes it has.
-        "height": e.height_sigma_m * pile_area * SHARED_WITH_FLOOR / math.sqrt(LEAST_ERRORS),
+        "position": flank * e.position_sigma_m,
+        "height": e.height_sigma_m * pile_area * BESIDE_FLOOR,
         "range": e.range_offset_sigma_m * abs(_per_range(e, area, flanks)),
         "floor": math.hypot(_floor(e, area), _thin(e)),
-        "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * _face(e),
+        "walls": math.hypot(e.wall_sigma_m, max(e.told_sigma_m, math.sqrt(DRIFTS) * e.position_sigma_m)) * _face(e),
         "contact": _contact_height(e, area),
         "interpolated": gaps,
         "unseen": math.hypot(hidden, _shadows(e)),
@@ -110,18 +108,25 @@ def _per_range(e: Evidence, area: Array, flanks: tuple[float, ...]) -> float:
 
 
 def _floor(e: Evidence, area: Array) -> float:
-    """The plane under the pile from the plane's covariance, and the undulation that the pile hides."""
+    """The floor under the piles: from the floor around each, or from the plane's covariance where there is none; and the
+    undulation that the pile hides."""
+    around = np.isfinite(e.rise_sigma_m)
+    near = _one_error_a_patch(around & e.pile, np.where(around, e.rise_sigma_m, 0.0) * area)
+    far = np.where(around, 0.0, area)
     x, y = e.grid.centres()
-    design = np.array([area.sum(), np.sum(area * (x - e.floor.centre_m[0])), np.sum(area * (y - e.floor.centre_m[1]))])
+    design = np.array([far.sum(), np.sum(far * (x - e.floor.centre_m[0])), np.sum(far * (y - e.floor.centre_m[1]))])
     plane = float(design @ e.floor.covariance @ design)
     hidden = e.floor.undulation_m**2 * float(area.sum()) * BLOCK_M**2
-    return math.sqrt(max(plane, 0.0) + hidden)
+    return math.sqrt(near**2 + max(plane, 0.0) + hidden)
 
 
 def _thin(e: Evidence) -> float:
     """What runs out beyond the rim too thin to be told from floor, or lifts what is taken for floor."""
-    along = e.pile & ~ndimage.binary_erosion(e.pile) & (e.depth_m > e.grid.cell_m)
-    return THIN_M * THIN_REACH_M * float(along.sum()) * e.grid.cell_m
+    edge = e.pile & ~ndimage.binary_erosion(e.pile) & (e.depth_m > e.grid.cell_m)
+    inner, begin = (ndimage.binary_erosion(e.pile, disc(cells_of(m, e.grid))) for m in (RIM_M, RIM_M - 0.5))
+    foot = begin & ~inner & (e.depth_m > RIM_M) & (e.share > 0)
+    thin_m = max(THIN_M, BELL * float(np.mean(e.height_m[foot]))) if foot.any() else THIN_M
+    return thin_m * THIN_REACH_M * float(edge.sum()) * e.grid.cell_m
 
 
 def _face(e: Evidence) -> float:
@@ -150,13 +155,20 @@ def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:
             reach = np.maximum(3.0 * reach, 0.3 * np.minimum(e.surface.gap_m, 10.0))
         # Outside the pile, too, something may lie where nothing was seen.
         weight = e.grid.cell_area_m2 * e.share * np.where(e.pile, 1.0, 0.5 if wanted == CellState.UNSEEN else 0.1)
-        out.append(_one_error_a_patch((state == wanted) & (e.share > 0), reach * weight))
+        # A gap is narrow and may be long: errors a few metres apart on the seen cells beside it are not the same.
+        parts = cells_of(GAP_M, e.grid) if wanted == CellState.INTERPOLATED else None
+        out.append(_one_error_a_patch((state == wanted) & (e.share > 0), reach * weight, parts))
     return out[0], out[1]
 
 
-def _one_error_a_patch(where: Mask, m3: Array) -> float:
-    """The sum of m3 over each connected patch, in quadrature."""
+def _one_error_a_patch(where: Mask, m3: Array, cells: int | None = None) -> float:
+    """The sum of m3 over each connected patch, in quadrature; cells: patches are cut into squares of so many."""
     label, n = ndimage.label(where)
+    if cells is not None:
+        row, column = np.indices(where.shape) // cells
+        square = row * (column.max() + 1) + column
+        _, label = np.unique(np.where(where, label * (square.max() + 1) + square, 0), return_inverse=True)
+        n = int(label.max())
     each = np.bincount(label.ravel(), m3.ravel(), minlength=n + 1)[1:]
     return math.sqrt(float(np.sum(each**2)))
 
@@ -183,7 +195,8 @@ def roughness(e: Evidence) -> float:
 
 
 def _obstacles(e: Evidence) -> float:
-    """Half of what each obstacle's foot would hold at the pile's height there, where one stands in the pile."""
+    """What each obstacle's foot would hold at the pile's height there, where one stands in the pile: anything from
+    nothing to all of it."""
     inside = e.pile & (e.share < 1.0) & (e.depth_m > 2 * e.grid.cell_m)
     cut = np.where(inside, (1.0 - e.share) * e.grid.cell_area_m2 * np.maximum(e.height_m, 0.0), 0.0)
-    return 0.5 * _one_error_a_patch(inside, cut)
+    return _one_error_a_patch(inside, cut) / math.sqrt(12.0)

@@ -32,7 +32,8 @@ class Footprint:
     polygon_m: (V, 2) counter-clockwise, in map. has_walls: False where the map's own extent had to do.
     share: (ny, nx) part of each cell inside the walls and outside obstacles. depth_m: (ny, nx) distance to the
     nearest wall, negative outside. blocked: cells whose returns belong to obstacles. noise_m: 1 sigma of wall returns
-    about the fitted walls. fit_sigma_m: of the walls' own place. pose_sigma_m: how far the keyframes disagree on it.
+    about the fitted walls. fit_sigma_m: of the walls' own place. pose_sigma_m, lap_sigma_m: how far single keyframes
+    disagree on it, and what that leaves of a lap; NaN where it cannot be told.
     beyond_ratio: share of all returns that lie beyond the walls, farther than noise throws them.
     """
 
@@ -44,6 +45,7 @@ class Footprint:
     noise_m: float
     fit_sigma_m: float
     pose_sigma_m: float
+    lap_sigma_m: float
     ceiling_m: float
     beyond_ratio: float
     warnings: tuple[str, ...]
@@ -174,7 +176,8 @@ def _open_footprint(grid: Grid, key: Index, ceiling: float) -> Footprint:
         blocked=np.zeros(grid.shape, dtype=np.bool_),
         noise_m=0.0,
         fit_sigma_m=0.0,
-        pose_sigma_m=0.0,
+        pose_sigma_m=float("nan"),
+        lap_sigma_m=float("nan"),
         ceiling_m=ceiling,
         beyond_ratio=0.0,
         warnings=(),
@@ -191,6 +194,7 @@ def _closed_footprint(
     fine, spread = _pull_to_wall(rough, points)
     polygon, fits = fit_edges(fine, points, spread)
     noise = float(np.median([f.noise_m for f in fits])) if fits else spread
+    pose_sigma, lap_sigma = pose_disagreement(fits, point_map.keyframe_id[wall])
     cx, cy = grid.centres()
     inside = contains(polygon, cx, cy)
     depth = np.where(inside, 1.0, -1.0) * edge_distance(polygon, cx, cy)
@@ -202,7 +206,8 @@ def _closed_footprint(
         blocked=np.zeros(grid.shape, dtype=np.bool_),
         noise_m=noise,
         fit_sigma_m=float(np.median([f.waviness_m for f in fits])) if fits else grid.cell_m,
-        pose_sigma_m=pose_disagreement(fits, points, point_map.keyframe_id[wall]),
+        pose_sigma_m=pose_sigma,
+        lap_sigma_m=lap_sigma,
         ceiling_m=ceiling,
         beyond_ratio=0.0,
         warnings=(),
