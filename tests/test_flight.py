@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -96,9 +97,9 @@ def test_results_are_written_whole(flown: Flown, tmp_path: Path) -> None:
 def test_qgroundcontrol_can_draw_track_height_and_speed_from_the_tlog(flown: Flown, folder: Path) -> None:
     """It takes the vehicle's kind from its first HEARTBEAT, its place from GLOBAL_POSITION_INT, its speed from VFR_HUD,
     and its height from ALTITUDE for good once it has seen one."""
-    log = mavutil.mavlink_connection(str(folder / "telemetry.tlog"))
     wanted = ["HEARTBEAT", "GLOBAL_POSITION_INT", "VFR_HUD", "ALTITUDE"]
-    heard = list(iter(partial(log.recv_match, type=wanted), None))
+    with closing(mavutil.mavlogfile(str(folder / "telemetry.tlog"))) as log:
+        heard = list(iter(partial(log.recv_match, type=wanted), None))
     vehicle = [m for m in heard if m.get_srcComponent() == 1]
     assert next(m for m in vehicle if m.get_type() == "HEARTBEAT").autopilot == 12
     places = [m for m in vehicle if m.get_type() == "GLOBAL_POSITION_INT"]
