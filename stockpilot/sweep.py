@@ -124,13 +124,16 @@ def fly_run(run: SweepRun, *, keep_map: bool = False) -> dict[str, Any]:
 
 
 def measure_run(run: SweepRun, *, result: dict[str, Any], map_file: Path) -> dict[str, Any]:
-    """The result of a flight with its volume measured anew from the map it left. Runs in a worker."""
+    """The result of a flight with its volume measured anew from the map it left. Runs in a worker.
+
+    What the true poses would give is left out: it needs the flight.
+    """
     _one_thread()
     from companion.volume import estimate_volume
     from stockpilot.results import volume_scores
 
     mission = load_mission(run.mission, run.settings, seed=run.seed)
-    report = result["report"]
+    report = {key: value for key, value in result["report"].items() if key != "e_v_percent_perfect_poses"}
     volume = estimate_volume(
         load_point_map(map_file), mission.companion.volume, is_cut_short=not report.get("lap_closed")
     )

@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -74,6 +74,7 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
     keyframes = _numbers(reports, "keyframes")
     c_c = _numbers(reports, "c_c")
     paper = [report.get("paper") or {} for report in reports]
+    intervals = [_interval_scores(report) for report in reports]
     return {
         "flights": len(reports),
         "completed": sum(report["state"] == "completed" for report in reports),
@@ -92,8 +93,8 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
         "abs_e_v_percent_max": _max(e_v),
         "abs_e_v_percent_perfect_poses_median": _median(np.abs(_numbers(reports, "e_v_percent_perfect_poses"))),
         "truth_in_interval_ratio": float(np.mean([bool(r.get("truth_in_interval")) for r in reports])),
-        "interval_half_width_percent_median": _median(_numbers(map(_interval_scores, reports), "half_width_percent")),
-        "error_over_sigma_rms": _rms(_numbers(map(_interval_scores, reports), "error_over_sigma")),
+        "interval_half_width_percent_median": _median(_numbers(intervals, "half_width_percent")),
+        "error_over_sigma_rms": _rms(_numbers(intervals, "error_over_sigma")),
         "outside_without_warning": sum(is_confident_and_wrong(report) for report in reports),
         "c_c_per_keyframe": float(c_c.sum() / keyframes.sum()) if keyframes.sum() else None,
         "paper_e_p_m_median": _median(_numbers(paper, "e_p_m")),
@@ -185,7 +186,7 @@ def fill_document(path: Path, name: str, results: Sequence[Result], *, command: 
 
 
 def _numbers(
-    rows: Iterable[Mapping[str, Any]], key: str, *, keep: bool = False
+    rows: Sequence[Mapping[str, Any]], key: str, *, keep: bool = False
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
     values = [row.get(key) for row in rows]
     if keep:

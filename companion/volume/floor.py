@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from companion.messages import Array
-from companion.volume.grid import Grid, Index, Mask, cells_of, disc
+from companion.volume.grid import Grid, Index, Mask, cells_of, disc, squares
 
 MAX_SLOPE = 0.12  # steeper than any floor that trucks drive on; loose material at rest is far steeper
 TRIALS = 500
@@ -109,13 +109,12 @@ def floor_beside(grid: Grid, floor: Floor, height: Array, pile: Mask) -> tuple[A
     label, n = ndimage.label(pile)
     near = ndimage.binary_dilation(pile, disc(cells_of(FROM_M, grid)))
     rise, sigma = np.zeros(grid.shape), np.full(grid.shape, np.nan)
-    block = cells_of(BLOCK_M, grid)
     row_at, column_at = np.indices(grid.shape).astype(np.float64)
-    row, column = np.indices(grid.shape) // block
+    block = squares(grid, BLOCK_M)
     for k in range(1, n + 1):
         own = label == k
         ring = ndimage.binary_dilation(own, disc(cells_of(TO_M, grid))) & ~near & floor.cells
-        _, of_block = np.unique(row[ring] * (column.max() + 1) + column[ring], return_inverse=True)
+        _, of_block = np.unique(block[ring], return_inverse=True)
         count = np.bincount(of_block)
         full = count >= LEAST_IN_BLOCK
         if full.sum() < LEAST_AROUND:

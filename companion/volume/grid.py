@@ -143,3 +143,10 @@ def disc(radius_cells: int) -> Mask:
 def cells_of(length_m: float, grid: Grid) -> int:
     """A length in whole cells, at least 1."""
     return max(1, int(np.ceil(length_m / grid.cell_m - 1e-9)))
+
+
+def squares(grid: Grid, side_m: float) -> Index:
+    """(ny, nx): the number of the square of that side that each cell lies in."""
+    side = cells_of(side_m, grid)
+    row, column = np.indices(grid.shape) // side
+    return np.asarray(row * (column.max() + 1) + column)

@@ -16,7 +16,7 @@ from scipy import ndimage
 from companion.messages import Array
 from companion.volume.contact import Contact
 from companion.volume.floor import BLOCK_M, Floor
-from companion.volume.grid import Grid, Mask, cells_of, disc
+from companion.volume.grid import Grid, Index, Mask, cells_of, disc, squares
 from companion.volume.keyframes import DRIFTS
 from companion.volume.surface import Cells, CellState, Surface
 
@@ -145,7 +145,7 @@ def _contact_height(e: Evidence, area: Array) -> float:
 
 
 def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:
-    """Gaps: the error grows with distance to the nearest seen cell, one error for each gap."""
+    """Gaps, and what was not seen: the error grows with distance to the nearest seen cell."""
     state = e.surface.state
     per_m = roughness(e)
     out = []
@@ -156,21 +156,18 @@ def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:
         # Outside the pile, too, something may lie where nothing was seen.
         weight = e.grid.cell_area_m2 * e.share * np.where(e.pile, 1.0, 0.5 if wanted == CellState.UNSEEN else 0.1)
         # A gap is narrow and may be long: errors a few metres apart on the seen cells beside it are not the same.
-        parts = cells_of(GAP_M, e.grid) if wanted == CellState.INTERPOLATED else None
-        out.append(_one_error_a_patch((state == wanted) & (e.share > 0), reach * weight, parts))
+        square = squares(e.grid, GAP_M) if wanted == CellState.INTERPOLATED else None
+        out.append(_one_error_a_patch((state == wanted) & (e.share > 0), reach * weight, square))
     return out[0], out[1]
 
 
-def _one_error_a_patch(where: Mask, m3: Array, cells: int | None = None) -> float:
-    """The sum of m3 over each connected patch, in quadrature; cells: patches are cut into squares of so many."""
-    label, n = ndimage.label(where)
-    if cells is not None:
-        row, column = np.indices(where.shape) // cells
-        square = row * (column.max() + 1) + column
-        _, label = np.unique(np.where(where, label * (square.max() + 1) + square, 0), return_inverse=True)
-        n = int(label.max())
-    each = np.bincount(label.ravel(), m3.ravel(), minlength=n + 1)[1:]
-    return math.sqrt(float(np.sum(each**2)))
+def _one_error_a_patch(where: Mask, m3: Array, square: Index | None = None) -> float:
+    """The sum of m3 over each connected patch, in quadrature; square: (ny, nx), patches are cut along their edges."""
+    patch, _ = ndimage.label(where)
+    if square is not None:
+        patch = patch * (square.max() + 1) + square
+    _, index = np.unique(patch[where], return_inverse=True)
+    return math.sqrt(float(np.sum(np.bincount(index, m3[where]) ** 2)))
 
 
 def _shadows(e: Evidence) -> float:
