@@ -18,6 +18,7 @@ from companion.computer import read_computer
 from companion.config import TelemetryConfig
 from companion.errors import FileFormatError
 from companion.flight import Flight
+from companion.garbage import collected_seldom
 from companion.mapping.export import save_point_map
 from companion.mavlink.keys import open_signer
 from companion.messages import Event, PointMap, Severity, VolumeReport
@@ -64,9 +65,10 @@ def fly_command(
     warm_up(mission.companion)
     began = time.monotonic()
     try:
-        asyncio.run(
-            app.run(ready=lambda: console.print(f"listening on {connect} and {lidar}; Ctrl-C lands the vehicle"))
-        )
+        with collected_seldom():
+            asyncio.run(
+                app.run(ready=lambda: console.print(f"listening on {connect} and {lidar}; Ctrl-C lands the vehicle"))
+            )
         report = flight_report(mission, flight, app, time.monotonic() - began)
         console.print("measuring ...", style="dim")
         volume = flight.measure() if flight.mapper.size else None

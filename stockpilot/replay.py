@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import json
 import tempfile
 import time
@@ -18,6 +17,7 @@ from pydantic import ValidationError
 from companion.config import CompanionConfig
 from companion.errors import ConfigError, FileFormatError
 from companion.flight import Flight
+from companion.garbage import collected_seldom
 from companion.messages import OdometryEstimate, VolumeReport
 from companion.odometry import ScanResult
 from companion.recording import ahead, codec
@@ -76,9 +76,8 @@ def replay_run(path: Path, settings: Sequence[str] = (), *, keep_messages: bool 
         estimates.append(result.estimate)
 
     replay = Replay(flight, keep_messages=keep_messages, on_scan=take)
-    gc.freeze()  # the inputs stay: to look through them again and again for garbage takes a tenth of the time
     began = time.perf_counter()
-    with contextlib.ExitStack() as stack:
+    with collected_seldom(), contextlib.ExitStack() as stack:
         if ahead.is_worthwhile():
             replay.scans = stack.enter_context(ahead.registering(flight, recording.inputs))
         replay.run(recording.inputs)

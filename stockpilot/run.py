@@ -15,6 +15,7 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from companion.errors import ConfigError
 from companion.flight import Flight
+from companion.garbage import collected_seldom
 from companion.warm_up import warm_up
 from simbridge.autopilot import Autopilot
 from simbridge.config import SimConfig
@@ -93,7 +94,8 @@ def fly_lockstep(
         )  # fmt: skip
         if attach is not None:
             attach(runner)
-        outcome = runner.run(progress)
+        with collected_seldom():
+            outcome = runner.run(progress)
     scored = score_flight(
         mission, prepared.flight, prepared.simulation.world, outcome, autopilot=autopilot,
         min_clearance_m=prepared.simulation.min_clearance_m, collision=prepared.simulation.collision,
