@@ -56,7 +56,7 @@ def is_confident_and_wrong(report: dict[str, Any]) -> bool:
     return report.get("volume_m3") is not None and not report.get("truth_in_interval") and not report.get("warnings")
 
 
-def _interval_scores(report: dict[str, Any]) -> dict[str, float]:
+def interval_scores(report: dict[str, Any]) -> dict[str, float]:
     """How wide the interval is and how far the error fills it; nothing where it has no upper end."""
     _, high = report.get("volume_interval_m3") or (None, None)
     volume, truth = report.get("volume_m3"), report.get("truth_volume_m3")
@@ -74,7 +74,7 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
     keyframes = _numbers(reports, "keyframes")
     c_c = _numbers(reports, "c_c")
     paper = [report.get("paper") or {} for report in reports]
-    intervals = [_interval_scores(report) for report in reports]
+    intervals = [interval_scores(report) for report in reports]
     return {
         "flights": len(reports),
         "completed": sum(report["state"] == "completed" for report in reports),
@@ -173,13 +173,18 @@ def results_block(name: str, results: Sequence[Result], command: str) -> str:
 
 def fill_document(path: Path, name: str, results: Sequence[Result], *, command: str) -> None:
     """Put the sweep's block between its markers. Raises: ConfigError: the document has none."""
-    begin, end = f"<!-- sweep {name}: begin -->", f"<!-- sweep {name}: end -->"
+    fill_block(path, f"sweep {name}", results_block(name, results, command))
+
+
+def fill_block(path: Path, name: str, block: str) -> None:
+    """Put text between a document's markers of that name. Raises: ConfigError: the document has none."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     text = path.read_text(encoding="utf-8")
     before, found, rest = text.partition(begin)
     _, found_end, after = rest.partition(end)
     if not found or not found_end:
-        raise ConfigError(f"{path}: expected the lines {begin} and {end} where the sweep's table belongs")
-    path.write_text(f"{before}{begin}\n{results_block(name, results, command)}\n{end}{after}", encoding="utf-8")
+        raise ConfigError(f"{path}: expected the lines {begin} and {end} where the table belongs")
+    path.write_text(f"{before}{begin}\n{block}\n{end}{after}", encoding="utf-8")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

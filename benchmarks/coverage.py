@@ -1,0 +1,95 @@
+"""Does the 95 % interval hold the truth in 90 to 99 % of flights? Over any number of sweeps at once.
+
+    python -m benchmarks.coverage runs/paper_sweep runs/random/flights runs/worlds ... [--docs docs/results.md] [--json]
+
+Each folder is one that `stockpilot sweep` wrote. Printed: for each sweep and for all of them how many flights gave a volume, in how
+many of them the interval holds the truth, with the 95 % range that this count leaves for the ratio (Clopper and Pearson,
+Biometrika 1934), how many that do not hold it carry no warning, and the errors over 1 sigma, RMS (1 where the interval is just as
+wide as it should be). Flights of one world err alike: what holds in many worlds says more than what holds in many flights of one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from companion.errors import ConfigError
+from stockpilot.sweep_report import fill_block, interval_scores, is_confident_and_wrong
+
+Report = dict[str, Any]
+WANTED = (0.90, 0.99)
+
+
+def reports_of(folder: Path) -> list[Report]:
+    """The reports of the flights that a sweep left there. Raises: ConfigError: there are none."""
+    found = []
+    for path in sorted(folder.glob("*.json")):
+        result = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(result, dict) and isinstance(result.get("report"), dict):
+            found.append(result["report"])
+    if not found:
+        raise ConfigError(
+            f"{folder}: no flights: expected the folder of a sweep (stockpilot sweep FILE --out {folder})"
+        )
+    return found
+
+
+def row(name: str, reports: Sequence[Report]) -> dict[str, Any]:
+    """What is said of some flights. Those that gave no volume are counted, and not among those that should hold the truth."""
+    told = [r for r in reports if r.get("volume_m3") is not None]
+    inside = sum(bool(r.get("truth_in_interval")) for r in told)
+    scores = [s["error_over_sigma"] for r in told if (s := interval_scores(r))]
+    low, high = binomtest(inside, len(told)).proportion_ci(0.95, "exact") if told else (math.nan, math.nan)
+    return {
+        "flights of": name,
+        "flights": len(reports),
+        "with a volume": len(told),
+        "inside": inside,
+        "inside, %": 100.0 * inside / len(told) if told else math.nan,
+        "95 % range, %": f"{100.0 * low:.1f} to {100.0 * high:.1f}",
+        "outside without a warning": sum(is_confident_and_wrong(r) for r in told),
+        "error over 1 sigma, RMS": float(np.sqrt(np.mean(np.square(scores)))) if scores else math.nan,
+    }
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown."""
+    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
+    lines += [
+        "| " + " | ".join(f"{v:.3g}" if isinstance(v, float) else str(v) for v in r.values()) + " |" for r in rows
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", type=Path, nargs="+", help="folders of sweeps")
+    parser.add_argument("--docs", type=Path, help="fill this document's block `coverage`")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    try:
+        by_sweep = {folder: reports_of(folder) for folder in args.folders}
+    except ConfigError as error:
+        parser.error(str(error))
+    rows = [row(str(folder), reports) for folder, reports in by_sweep.items()]
+    rows.append(row("all", [report for reports in by_sweep.values() for report in reports]))
+    if args.docs is not None:
+        command = f"`python -m benchmarks.coverage {' '.join(map(str, args.folders))}`"
+        fill_block(args.docs, "coverage", f"{command}\n\n{table(rows)}")
+    print(json.dumps(rows, indent=2) if args.json else table(rows))
+    ratio = rows[-1]["inside, %"] / 100.0
+    if not args.json:
+        print(
+            f"wanted: {WANTED[0]:.0%} to {WANTED[1]:.0%}; {'reached' if WANTED[0] <= ratio <= WANTED[1] else 'not reached'}"
+        )
+
+
+if __name__ == "__main__":
+    main()
