@@ -16,8 +16,10 @@ from companion.recording.mcap_read import Attachment, Message, Metadata, open_mc
 from companion.recording.recover import RECOVERED
 from companion.recording.run_files import read_run
 from companion.recording.tlog import read_tlog
+from stockpilot.carmen import carmen_lines
 from stockpilot.file_kinds import FileKind, file_kind
-from stockpilot.scan_files import carmen_lines, decoder_of, metadata_beside, open_bag
+from stockpilot.ros_scans import open_bag
+from stockpilot.scan_files import decoder_of, metadata_beside
 
 GAP_FACTOR = 5.0  # a gap this many times the usual interval of a steady stream is told
 GAP_LEAST_NS = 500_000_000

@@ -18,8 +18,9 @@ from companion.messages import Array, PointMap
 from companion.odometry.loop_closure import LoopCloser
 from companion.odometry.planar import PlanarMatcher
 from companion.recording.tum import seconds
+from stockpilot.file_scan import FileScan, ScanFile
 from stockpilot.files import require_place
-from stockpilot.scan_files import FileScan, ScanFile, open_scans
+from stockpilot.scan_files import open_scans
 
 MAP_EVERY_M = 0.3  # a scan goes into the map when the scanner has moved this far or turned this much
 MAP_EVERY_RAD = math.radians(10.0)

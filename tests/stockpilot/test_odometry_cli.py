@@ -14,8 +14,9 @@ from typer.testing import CliRunner
 from benchmarks.scans2d import relation_errors
 from companion.mapping.export import load_point_map
 from companion.odometry.planar import PlanarMatcher
+from stockpilot.file_scan import FileScan
 from stockpilot.odometry_cli import odometry_command, track
-from stockpilot.scan_files import FileScan, open_scans
+from stockpilot.scan_files import open_scans
 from tests.shared_data import shared_data
 
 RUNNER = CliRunner()

@@ -18,7 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from companion.errors import FileFormatError
 from stockpilot.file_kinds import FileKind, file_kind
-from stockpilot.scan_files import FileScan, open_scans
+from stockpilot.file_scan import FileScan
+from stockpilot.scan_files import open_scans
 from tests.companion.lidar.packets import frame_packets, sensor
 from tests.companion.lidar.test_pcap import classic, ip
 from tests.shared_data import shared_data
@@ -128,6 +129,29 @@ def test_mcap_with_point_clouds(tmp_path: Path) -> None:
     assert scan.t_ns == STAMP_NS
     assert len(scan.points_3d) == 4
     np.testing.assert_allclose(scan.points, [[3.0, 1.0], [-4.0, 2.0]], rtol=1e-6)
+
+
+def test_ros_messages_that_cannot_be_read_are_counted_and_the_others_kept(tmp_path: Path) -> None:
+    kind = "sensor_msgs/msg/PointCloud2"
+    whole = bytes(STORE.serialize_cdr(point_cloud(STORE, np.array([[3.0, 1.0, 0.01], [3.0, 0.0, 2.0]])), kind))
+    cut = whole[:-20]
+    path = tmp_path / "clouds"
+    write_mcap(path, kind, "/points", [cut, whole, b"\x00\x01\x00\x00", whole, b""])
+    read = open_scans(path)
+    assert len(list(read.scans)) == 2
+    assert read.dropped == {"messages that cannot be read": 3}
+    write_mcap(path, kind, "/points", [cut, b""])
+    with pytest.raises(FileFormatError, match=r"clouds: none of the messages on /points can be read"):
+        scans_of(path)
+    needs_version = "version" in inspect.signature(Writer2.__init__).parameters
+    bag_path = tmp_path / "bag"
+    with Writer2(bag_path, version=9) if needs_version else Writer2(bag_path) as bag:
+        connection = bag.add_connection("/points", kind, typestore=STORE)
+        for n, data in enumerate([whole, cut, whole]):
+            bag.write(connection, 5 + n, data)
+    read = open_scans(bag_path)
+    assert len(list(read.scans)) == 2
+    assert read.dropped == {"messages that cannot be read": 1}
 
 
 @pytest.mark.parametrize("packed", [False, True])
