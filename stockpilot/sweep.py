@@ -178,6 +178,10 @@ def sweep_command(
     """
     from stockpilot.sweep_report import fill_document, summarise, write_sweep_report
 
+    if remeasure and (keep_maps or limit is not None):
+        raise ConfigError(
+            "--remeasure measures all flights that are there again: --limit and --keep-maps do not go with it"
+        )
     sweep, runs = load_sweep(sweep_file)
     name = sweep.name or sweep_file.stem
     folder = out or Path("runs") / name

@@ -167,6 +167,9 @@ def test_volume_is_measured_again_in_the_maps_that_were_kept(tmp_path: Path) -> 
     command = [str(sweep_file), "--out", str(tmp_path), "--remeasure", "--workers", "1", "--json"]
     with pytest.raises(ConfigError, match="--keep-maps"):
         CliRunner().invoke(app, command, catch_exceptions=False)
+    for other in (["--limit", "1"], ["--keep-maps"]):
+        with pytest.raises(ConfigError, match="do not go with it"):
+            CliRunner().invoke(app, [*command, *other], catch_exceptions=False)
 
     save_point_map(made.point_map, tmp_path / f"{runs[0].name}.ply")
     told = CliRunner().invoke(app, command)
