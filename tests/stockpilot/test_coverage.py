@@ -54,7 +54,9 @@ def test_table_of_several_sweeps_goes_into_a_document(tmp_path: Path, monkeypatc
     coverage.main()
     assert "| all | 4 | 4 | 3 | 75 |" in capsys.readouterr().out
     text = document.read_text()
-    assert text.startswith("above\n") and text.endswith("below\n")
-    assert "| all | 4 | 4 | 3 | 75 |" in text and "old" not in text
+    assert text.startswith("above\n")
+    assert text.endswith("below\n")
+    assert "| all | 4 | 4 | 3 | 75 |" in text
+    assert "old" not in text
     with pytest.raises(ConfigError, match="nothing: begin"):
         fill_block(document, "nothing", "text")
