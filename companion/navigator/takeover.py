@@ -9,6 +9,7 @@ from companion.navigator.interface import NavigatorInput, NavigatorState
 from companion.navigator.situation import Situation
 
 READY_FOR_NS = 1_000_000_000
+TELL_EVERY_NS = 2_000_000_000  # at most, of what forbids arming
 LINK_LOST_NS = 3_000_000_000
 LANDING_MODES = frozenset({FlightMode.LAND, FlightMode.DESCEND})
 
@@ -41,18 +42,23 @@ class Readiness:
     """Ready means ready and seeing for READY_FOR_NS without a break."""
 
     def __init__(self) -> None:
-        self._why: tuple[str, ...] = ()
+        self._told: set[str] = set()  # the kinds of reasons that people were told last
+        self._told_ns: int | None = None
         self._since_ns: int | None = None
 
     def note(self, now: Situation, inputs: NavigatorInput) -> str:
-        """What forbids arming, for people, when that has changed: not just how much is missing; else empty."""
-        before, self._why = self._why, not_ready(now, inputs)
-        if self._why:
-            self._since_ns = None
-        elif self._since_ns is None:
-            self._since_ns = now.t_ns
-        kinds = [{reason.partition(":")[0] for reason in why} for why in (before, self._why)]
-        return "not ready: " + "; ".join(self._why) if self._why and kinds[0] != kinds[1] else ""
+        """What forbids arming, for people, when that has changed: not just how much is missing, and not each of the many
+        changes in the first second; else empty."""
+        why = not_ready(now, inputs)
+        if not why:
+            self._told, self._since_ns = set(), now.t_ns if self._since_ns is None else self._since_ns
+            return ""
+        self._since_ns = None
+        kinds = {reason.partition(":")[0] for reason in why}
+        if kinds == self._told or (self._told_ns is not None and now.t_ns - self._told_ns < TELL_EVERY_NS):
+            return ""
+        self._told, self._told_ns = kinds, now.t_ns
+        return "not ready: " + "; ".join(why)
 
     def is_ready(self, now: Situation) -> bool:
         return self._since_ns is not None and now.t_ns - self._since_ns >= READY_FOR_NS

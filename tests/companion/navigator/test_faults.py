@@ -224,6 +224,22 @@ def test_it_does_not_arm_before_all_is_ready_and_says_why(why):
     assert words[why] in said[0]
 
 
+def test_reasons_that_change_all_the_time_are_told_at_most_each_two_seconds_and_the_last_is_told():
+    navigator = Navigator(CompanionConfig())
+    said = []
+    for n in range(200):
+        t = 10**10 + n * 50 * MS
+        reason = f"step {min(n, 20)}: going on"
+        state = vehicle(t, is_armed=False, is_ready_to_arm=False, not_ready_because=(reason,))
+        output = navigator.step(
+            t, NavigatorInput(estimate=estimate(t), walls=walls(t), vehicle=state, time_synced=True)
+        )
+        said += [(n, e.text) for e in output.events]
+    assert [n for n, _ in said] == [0, 40]
+    assert "step 0" in said[0][1]
+    assert "step 20" in said[1][1]
+
+
 def test_it_gives_up_when_the_vehicle_will_not_arm(flown_to):
     """PX4.md: "arming is then refused (TEMPORARILY_REJECTED) while the signal is missing"."""
     rig = flown_to(S.ARMING)
