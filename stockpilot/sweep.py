@@ -53,6 +53,9 @@ class SweepRun:
     seed: int
     perfect_poses: bool
 
+    def __hash__(self) -> int:
+        return hash(self.name)  # values of a grid may be lists
+
 
 def load_sweep(path: Path) -> tuple[SweepFile, list[SweepRun]]:
     """The sweep and its runs, every mission validated before anything flies. Raises: ConfigError."""

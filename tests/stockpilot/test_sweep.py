@@ -196,5 +196,26 @@ def test_how_wide_the_interval_is_and_how_full_is_told() -> None:
     assert told["interval_half_width_percent_median"] == pytest.approx(1.96, rel=0.02)
 
 
+def test_values_of_a_grid_may_be_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """missions/sweeps/mount.yaml has some; they ended in "unhashable type" before anything flew."""
+    sweep_file = tmp_path / "sweep.yaml"
+    sweep_file.write_text(
+        f"missions: [{MISSIONS / 'cement_store.yaml'}]\ngrid:\n  lidar.mount_error_rpy_deg: [[2, 0, 0], [0, 2, 0]]\n",
+        encoding="utf-8",
+    )
+
+    def instead_of_flying(jobs, *_):
+        for run, job in jobs.items():
+            assert job.args == (run,)
+            yield run, result(run.name, speed=0.43, seed=0, e_p=0.01, e_v=0.1, keyframes=40)
+
+    monkeypatch.setattr("stockpilot.sweep._compute_all", instead_of_flying)
+    app = typer.Typer()
+    app.command()(sweep_command)
+    told = CliRunner().invoke(app, [str(sweep_file), "--out", str(tmp_path), "--json"], catch_exceptions=False)
+    assert told.exit_code == 0
+    assert json.loads(told.stdout)["flights"] == 2
+
+
 def test_row_is_flat() -> None:
     assert all(not isinstance(value, dict | list) for value in flat_row(RESULTS[0]).values())
