@@ -2,7 +2,8 @@
 
 Heights between seen places are linear, and carried on at the walls: behind a crest both are as high as the surface can be
 without being seen, or higher than beams that passed there. Loose material falls behind its crest as in front of it. So what
-is hidden is laid in the middle of what it can be, and the interval is told how far apart the ends are.
+is hidden is laid in the middle of what it can be, and the interval is told how far apart the ends are. So are summits too near the
+sensor's own height to give anything back: between a lid over what was seen around them and their flanks going on.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import ndimage
 
 from companion.jit import kernel
 from companion.messages import Array, PointMap
@@ -64,10 +66,37 @@ def lay_hidden(point_map: PointMap, grid: Grid, surface: Surface, floor_z: Array
     passed = _passed(point_map.points_map - origin, path, scan, grid.shape, grid.cell_m, 3.0 * noise_m)[gaps]
     highest = np.maximum(np.minimum(z, passed), lowest)
     is_hidden = ~is_enclosed & (np.minimum(highest, in_sight) - lowest > HIDDEN_M)
+    rise = _summits(surface, gaps, seen, grid, np.where(is_enclosed, passed, -np.inf))
     z_m, sigma_m = surface.z_m.copy(), np.zeros(grid.shape)
-    z_m[gaps] = np.where(is_hidden, 0.5 * (highest + lowest), np.minimum(z, highest + PASSED_NOISE_M))
-    sigma_m[gaps] = np.where(is_hidden, (highest - lowest) / math.sqrt(12.0), 0.0)
+    z_m[gaps] = np.where(is_hidden, 0.5 * (highest + lowest), np.minimum(z, highest + PASSED_NOISE_M) + 0.5 * rise)
+    sigma_m[gaps] = np.where(is_hidden, highest - lowest, rise) / math.sqrt(12.0)
     return Shadow(surface=replace(surface, z_m=z_m), sigma_m=sigma_m)
+
+
+def _summits(surface: Surface, gaps: Mask, seen: Mask, grid: Grid, passed: Array) -> Array:
+    """By how much each of the gaps' cells may lie higher than a plain lid over what was seen: as high as the flanks on all
+    sides let it, going on, and beams that passed. The sensor looks level at best, and a summit near its own height gives
+    nothing back.
+
+    passed: of the gaps, -inf where none may rise. Returns: of the gaps; 0 in patches that rise by less than HIDDEN_M.
+    """
+    x, y = grid.centres()
+    limit, rise = np.full(grid.shape, -np.inf), np.zeros(grid.shape)
+    limit[gaps] = passed
+    bound = np.minimum(1.0, STEEPEST_FALL / np.maximum(np.hypot(surface.slope_x, surface.slope_y), 1e-9))
+    patches, _ = ndimage.label(limit > -np.inf)
+    for n, box in enumerate(ndimage.find_objects(patches), start=1):
+        around = tuple(slice(max(0, side.start - 1), side.stop + 1) for side in box)
+        patch = patches[around] == n
+        rim = ndimage.binary_dilation(patch, np.ones((3, 3), dtype=np.bool_)) & seen[around]
+        flanks = (v[around][rim] for v in (surface.z_m, bound * surface.slope_x, bound * surface.slope_y, x, y))
+        up = limit[around][patch]
+        for z, to_x, to_y, from_x, from_y in zip(*flanks, strict=True):
+            up = np.minimum(up, z + to_x * (x[around][patch] - from_x) + to_y * (y[around][patch] - from_y))
+        up = np.maximum(up - surface.z_m[around][patch], 0.0)
+        if rim.any() and up.max() > HIDDEN_M:
+            rise[around][patch] = up
+    return rise[gaps]
 
 
 def _places(point_map: PointMap) -> Array:

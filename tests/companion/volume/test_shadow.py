@@ -1,4 +1,7 @@
-"""What a crest hides: a slope that rises to a crest, seen from its own side, and the wall behind it."""
+"""What a crest hides: a slope that rises to a crest, seen from its own side, and the wall behind it.
+
+And what hides by standing too high: a summit.
+"""
 
 from __future__ import annotations
 
@@ -82,6 +85,51 @@ def test_gap_with_seen_places_all_around_stays_as_it_is() -> None:
     shadow = laid(seen, point_map(7.0, beams_to_wall=False))
     assert (shadow.surface.z_m == carried_on()).all()
     assert not shadow.sigma_m.any()
+
+
+def heap(seen: Array, *, falling_side: bool = False) -> tuple[Surface, Shadow]:
+    """A cone with its peak at (7.5, 7.5) under a lid over what was not seen; falling_side: one flank falls into the gap."""
+    r = np.maximum(np.hypot(X - 7.5, Y - 7.5), 1e-9)
+    cone = 5.0 - SLOPE * r
+    z = np.where(seen, cone, cone[seen].max())
+    slope_x, slope_y = -SLOPE * (X - 7.5) / r, -SLOPE * (Y - 7.5) / r
+    if falling_side:
+        slope_x = np.where(X > 7.5, SLOPE, slope_x)
+    state = np.where(seen, CellState.SEEN, CellState.INTERPOLATED).astype(np.int8)
+    gap = ndimage.distance_transform_edt(~seen) * CELL_M
+    surface = Surface(z_m=z, carried_m=z, state=state, gap_m=gap, slope_x=slope_x, slope_y=slope_y)
+    angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+    path, ends = (
+        np.column_stack([7.5 + r * np.cos(angle), 7.5 + r * np.sin(angle), np.full(40, h)])
+        for r, h in ((6.0, 5.2), (7.0, 0.8))
+    )
+    scan = np.arange(40)
+    of = PointMap(points_map=ends, keyframe_id=scan, range_m=np.ones(40), path_map=path, scan_index=scan)
+    return surface, lay_hidden(of, GRID, surface, np.full(GRID.shape, -10.0), 0.03)
+
+
+def test_summit_that_was_not_seen_is_laid_between_a_lid_and_its_flanks_going_on() -> None:
+    seen = np.hypot(X - 7.5, Y - 7.5) > 1.5
+    lid, shadow = heap(seen)
+    peak = np.argmin(np.abs(GRID.x_m - 7.5))
+    rise = shadow.surface.z_m - lid.z_m
+    assert rise[peak, peak] == pytest.approx(0.5 * SLOPE * 1.4, abs=0.12)
+    assert shadow.sigma_m[peak, peak] == pytest.approx(SLOPE * 1.4 / np.sqrt(12.0), abs=0.08)
+    assert (rise[seen] == 0.0).all()
+    assert not shadow.sigma_m[seen].any()
+    cone_m = np.maximum(5.0 - SLOPE * np.hypot(X - 7.5, Y - 7.5) - lid.z_m, 0.0)[~seen]
+    assert 0.35 * cone_m.sum() < rise.sum() < 0.65 * cone_m.sum()
+
+
+def test_gap_that_a_flank_falls_into_is_no_summit() -> None:
+    lid, shadow = heap(np.hypot(X - 7.5, Y - 7.5) > 1.5, falling_side=True)
+    assert (shadow.surface.z_m == lid.z_m).all()
+    assert not shadow.sigma_m.any()
+
+
+def test_small_hole_in_a_summit_stays_as_it_is() -> None:
+    lid, shadow = heap(np.hypot(X - 7.5, Y - 7.5) > 0.3)
+    assert (shadow.surface.z_m == lid.z_m).all()
 
 
 def test_map_that_does_not_tell_where_it_was_seen_from_stays_as_it_is() -> None:
