@@ -65,12 +65,32 @@ def lay_hidden(point_map: PointMap, grid: Grid, surface: Surface, floor_z: Array
     path = point_map.path_map - origin
     passed = _passed(point_map.points_map - origin, path, scan, grid.shape, grid.cell_m, 3.0 * noise_m)[gaps]
     highest = np.maximum(np.minimum(z, passed), lowest)
+    too_high = np.maximum(z - highest - PASSED_NOISE_M, 0.0)
+    on_way = np.where(is_enclosed, 0.0, _on_way(too_high, gaps, seen))
+    highest = np.where(on_way > too_high, np.maximum(z - on_way - PASSED_NOISE_M, lowest), highest)
     is_hidden = ~is_enclosed & (np.minimum(highest, in_sight) - lowest > HIDDEN_M)
     rise = _summits(surface, gaps, seen, grid, np.where(is_enclosed, passed, -np.inf))
     z_m, sigma_m = surface.z_m.copy(), np.zeros(grid.shape)
     z_m[gaps] = np.where(is_hidden, 0.5 * (highest + lowest), np.minimum(z, highest + PASSED_NOISE_M) + 0.5 * rise)
     sigma_m[gaps] = np.where(is_hidden, highest - lowest, rise) / math.sqrt(12.0)
     return Shadow(surface=replace(surface, z_m=z_m), sigma_m=sigma_m)
+
+
+def _on_way(too_high_m: Array, gaps: Mask, seen: Mask) -> Array:
+    """By what each of the gaps' cells is too high at least, since what is carried on to it from the nearest seen cell is too
+    high by that on the way. (Right before a wall beams do not tell: their ends are blurred by noise.)
+
+    too_high_m: of the gaps, by the beams that passed.
+    """
+    _, (i, j) = ndimage.distance_transform_edt(~seen, return_indices=True)
+    rows, columns = np.nonzero(gaps)
+    of_cell, most = np.zeros(gaps.shape), np.zeros(len(rows))
+    of_cell[gaps] = too_high_m
+    for part in (0.25, 0.5, 0.75):
+        row = np.rint(rows + part * (i[rows, columns] - rows)).astype(np.int64)
+        column = np.rint(columns + part * (j[rows, columns] - columns)).astype(np.int64)
+        most = np.maximum(most, of_cell[row, column])
+    return most
 
 
 def _summits(surface: Surface, gaps: Mask, seen: Mask, grid: Grid, passed: Array) -> Array:

@@ -42,13 +42,13 @@ def point_map(height_m: float, *, beams_to_wall: bool = True) -> PointMap:
     )
 
 
-def laid(seen: Array, of: PointMap) -> Shadow:
+def laid(seen: Array, of: PointMap, noise_m: float = 0.03) -> Shadow:
     z = carried_on()
     state = np.where(seen, CellState.SEEN, CellState.UNSEEN).astype(np.int8)
     gap = ndimage.distance_transform_edt(~seen) * CELL_M
     flat = np.zeros(GRID.shape)
     surface = Surface(z_m=z, carried_m=z, state=state, gap_m=gap, slope_x=flat, slope_y=flat)
-    return lay_hidden(of, GRID, surface, np.zeros(GRID.shape), 0.03)
+    return lay_hidden(of, GRID, surface, np.zeros(GRID.shape), noise_m)
 
 
 def test_behind_a_crest_it_is_laid_between_sight_and_the_steepest_fall() -> None:
@@ -78,6 +78,15 @@ def test_nothing_lies_where_beams_passed() -> None:
     assert shadow.surface.z_m[middle, at] < carried_on()[middle, at] - 1.0
     assert shadow.surface.z_m[middle, at] >= max(passed, CREST_Z_M - STEEPEST_FALL * (GRID.x_m[at] - CREST_X_M)) - 0.15
     assert not shadow.sigma_m[middle, at]
+
+
+def test_right_before_a_wall_where_noise_blurs_beams_it_is_lowered_as_on_the_way_there() -> None:
+    shadow = laid(X < CREST_X_M, point_map(14.0), noise_m=0.3)
+    middle = np.argmin(np.abs(GRID.y_m - 7.5))
+    lowered = (carried_on() - shadow.surface.z_m)[middle]
+    on_way, before_wall = (np.argmin(np.abs(GRID.x_m - x)) for x in (13.6, 14.6))
+    assert lowered[on_way] > 1.0
+    assert lowered[before_wall] >= lowered[on_way] - 0.01
 
 
 def test_gap_with_seen_places_all_around_stays_as_it_is() -> None:
