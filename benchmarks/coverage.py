@@ -21,7 +21,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 from companion.errors import ConfigError
-from stockpilot.sweep_report import fill_block, interval_scores, is_confident_and_wrong
+from stockpilot.sweep import read_result
+from stockpilot.sweep_report import fill_block, interval_scores, is_confident_and_wrong, rms
 
 Report = dict[str, Any]
 WANTED = (0.90, 0.99)
@@ -29,11 +30,7 @@ WANTED = (0.90, 0.99)
 
 def reports_of(folder: Path) -> list[Report]:
     """The reports of the flights that a sweep left there. Raises: ConfigError: there are none."""
-    found = []
-    for path in sorted(folder.glob("*.json")):
-        result = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(result, dict) and isinstance(result.get("report"), dict):
-            found.append(result["report"])
+    found = [r["report"] for path in sorted(folder.glob("*.json")) if (r := read_result(path)) is not None]
     if not found:
         raise ConfigError(
             f"{folder}: no flights: expected the folder of a sweep (stockpilot sweep FILE --out {folder})"
@@ -55,7 +52,7 @@ def row(name: str, reports: Sequence[Report]) -> dict[str, Any]:
         "inside, %": 100.0 * inside / len(told) if told else math.nan,
         "95 % range, %": f"{100.0 * low:.1f} to {100.0 * high:.1f}",
         "outside without a warning": sum(is_confident_and_wrong(r) for r in told),
-        "error over 1 sigma, RMS": float(np.sqrt(np.mean(np.square(scores)))) if scores else math.nan,
+        "error over 1 sigma, RMS": rms(np.array(scores)) if scores else math.nan,
     }
 
 

@@ -238,18 +238,20 @@ def spread(runs: Sequence[SweepRun], limit: int | None) -> list[SweepRun]:
 
 def read_results(folder: Path, runs: Iterable[SweepRun]) -> dict[str, dict[str, Any]]:
     """Results that are there and whole, by run name."""
-    out: dict[str, dict[str, Any]] = {}
-    for run in runs:
-        path = folder / f"{run.name}.json"
-        if path.exists():
-            try:
-                result = json.loads(path.read_text(encoding="utf-8"))
-            except (json.JSONDecodeError, UnicodeDecodeError):
-                print(f"{path}: not whole: flown again", file=sys.stderr)
-                continue
-            if isinstance(result, dict) and "report" in result:
-                out[run.name] = result
-    return out
+    found = {run.name: read_result(folder / f"{run.name}.json") for run in runs}
+    return {name: result for name, result in found.items() if result is not None}
+
+
+def read_result(path: Path) -> dict[str, Any] | None:
+    """A flight's result; None where it is missing, is not whole (told), or is something else."""
+    if not path.exists():
+        return None
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        print(f"{path}: not whole: it does not count", file=sys.stderr)
+        return None
+    return result if isinstance(result, dict) and "report" in result else None
 
 
 def _map_file(folder: Path, run: SweepRun) -> Path:

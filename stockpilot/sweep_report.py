@@ -66,6 +66,11 @@ def interval_scores(report: dict[str, Any]) -> dict[str, float]:
     return {"half_width_percent": 100.0 * (high - volume) / truth, "error_over_sigma": (volume - truth) / sigma}
 
 
+def rms(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
+    """Root of the mean square; None of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
 def summarise(results: Sequence[Result]) -> dict[str, Any]:
     """The figures that the targets speak of, over all flights."""
     reports = [result["report"] for result in results]
@@ -94,7 +99,7 @@ def summarise(results: Sequence[Result]) -> dict[str, Any]:
         "abs_e_v_percent_perfect_poses_median": _median(np.abs(_numbers(reports, "e_v_percent_perfect_poses"))),
         "truth_in_interval_ratio": float(np.mean([bool(r.get("truth_in_interval")) for r in reports])),
         "interval_half_width_percent_median": _median(_numbers(intervals, "half_width_percent")),
-        "error_over_sigma_rms": _rms(_numbers(intervals, "error_over_sigma")),
+        "error_over_sigma_rms": rms(_numbers(intervals, "error_over_sigma")),
         "outside_without_warning": sum(is_confident_and_wrong(report) for report in reports),
         "c_c_per_keyframe": float(c_c.sum() / keyframes.sum()) if keyframes.sum() else None,
         "paper_e_p_m_median": _median(_numbers(paper, "e_p_m")),
@@ -209,10 +214,6 @@ def _min(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
 
 def _max(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
     return float(np.max(values)) if len(values) else None
-
-
-def _rms(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def _short(value: Any) -> str:

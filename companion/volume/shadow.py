@@ -110,10 +110,10 @@ def _summits(surface: Surface, gaps: Mask, seen: Mask, grid: Grid, passed: Array
         patch = patches[around] == n
         rim = ndimage.binary_dilation(patch, np.ones((3, 3), dtype=np.bool_)) & seen[around]
         flanks = (v[around][rim] for v in (surface.z_m, bound * surface.slope_x, bound * surface.slope_y, x, y))
-        up = limit[around][patch]
+        up, at_x, at_y, lid = (v[around][patch] for v in (limit, x, y, surface.z_m))
         for z, to_x, to_y, from_x, from_y in zip(*flanks, strict=True):
-            up = np.minimum(up, z + to_x * (x[around][patch] - from_x) + to_y * (y[around][patch] - from_y))
-        up = np.maximum(up - surface.z_m[around][patch], 0.0)
+            up = np.minimum(up, z + to_x * (at_x - from_x) + to_y * (at_y - from_y))
+        up = np.maximum(up - lid, 0.0)
         if rim.any() and up.max() > HIDDEN_M:
             rise[around][patch] = up
     return rise[gaps]
