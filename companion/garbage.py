@@ -13,8 +13,8 @@ YOUNG = 50_000  # objects more than were freed, before the young ones are looked
 def collected_seldom() -> Iterator[None]:
     """Within: what is there already is not looked through, and what comes is only after many thousand objects.
 
-    A flight makes next to no cycles (reference counts free what it drops), yet keeps every estimate and event: to look
-    through them again and again took a tenth of a flight's time.
+    A flight makes next to no cycles (reference counts free what it drops), yet keeps every estimate and event, and to look
+    through all of them takes longer the longer it flies.
     """
     before = gc.get_threshold()
     gc.freeze()
