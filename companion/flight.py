@@ -168,7 +168,7 @@ class Flight:
         if estimate.is_keyframe:
             self.keyframes.append(estimate)
             self.tap(topics.KEYFRAME, t_ns, estimate)
-        return self._belongs_in_map(estimate)
+        return self.belongs_in_map(estimate)
 
     def poll(self, t_ns: int) -> None:
         """Do what is due: estimates, setpoints, heartbeats. Call at `next_deadline_ns`, or more often."""
@@ -301,7 +301,8 @@ class Flight:
             name = "degenerate" if weak else "no_longer_degenerate"
             self.tell(Event(t_ns=t_ns, severity=Severity.WARNING if weak else Severity.INFO, name=name, text=text))
 
-    def _belongs_in_map(self, estimate: OdometryEstimate) -> bool:
+    def belongs_in_map(self, estimate: OdometryEstimate) -> bool:
+        """Whether the scan of an estimate goes into the map; asked once of each, in order."""
         if estimate.quality <= 0 or not estimate.converged:
             return False
         period_ns = round(self.config.mapping.scan_period_s * 1e9)

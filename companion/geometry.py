@@ -55,7 +55,11 @@ def quat_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
 
 def rpy_from_quat(q_wxyz: Array) -> tuple[float, float, float]:
     """(roll, pitch, yaw), rad; pitch in [-pi/2, pi/2]."""
-    w, x, y, z = q_wxyz.tolist()
+    return rpy_from_parts(*q_wxyz.tolist())
+
+
+def rpy_from_parts(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """The same of a quaternion's parts."""
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fastcrc import crc16
 
@@ -20,8 +20,7 @@ def crc(data: bytes) -> int:
     return crc16.mcrf4xx(data)
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """One whole frame whose checksum is right. signature: 13 bytes (link, time, hash), empty when unsigned.
     signed_part: what the hash covers, from the magic to the end of the checksum."""
 
@@ -47,10 +46,11 @@ class Decoder:
         buffer = self._buffer + data if self._buffer else data
         frames: list[Frame] = []
         at = 0
-        while True:
+        while at < len(buffer):
             start = _next_magic(buffer, at)
-            self.dropped["garbage_bytes"] += start - at
-            at = start
+            if start != at:
+                self.dropped["garbage_bytes"] += start - at
+                at = start
             size = _frame_size(buffer, at)
             if size is None or at + size > len(buffer):
                 break
@@ -66,6 +66,8 @@ class Decoder:
 
 
 def _next_magic(buffer: bytes, at: int) -> int:
+    if buffer[at] == _MAGIC_2:
+        return at  # nearly always
     two = buffer.find(_MAGIC_2, at)
     one = buffer.find(_MAGIC_1, at, two if two >= 0 else len(buffer))
     if one >= 0:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.geometry import rpy_from_quat
+from companion.geometry import rpy_from_parts
 from companion.jit import kernel
 from companion.messages import Array, AttitudeSample
 
@@ -93,8 +93,9 @@ class AttitudeBuffer:
         if not is_sound or (old is not None and sample.t_ns <= self.newest_ns):
             self.dropped += 1
             return False
-        q = q / math.sqrt(norm)
-        roll, pitch, _ = rpy_from_quat(q)
+        root = math.sqrt(norm)
+        w, x, y, z = w / root, x / root, y / root, z / root
+        roll, pitch, _ = rpy_from_parts(w, x, y, z)
         yaw_rate = (rate_y * math.sin(roll) + rate_z * math.cos(roll)) / max(math.cos(pitch), 0.1)
         row = roll, pitch, 0.0, yaw_rate
         if old is not None:
@@ -102,7 +103,7 @@ class AttitudeBuffer:
             dt_s = (sample.t_ns - self.newest_ns) * 1e-9
             row = roll, pitch, yaw + 0.5 * (yaw_rate + rate_before) * dt_s, yaw_rate
         self.newest_ns, self._newest = sample.t_ns, row
-        self._append(sample.t_ns, row, q, rate)
+        self._append(sample.t_ns, row, np.array([w, x, y, z]), rate)
         return True
 
     def _append(self, t_ns: int, row: tuple[float, float, float, float], q: Array, rate: Array) -> None:

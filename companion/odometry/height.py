@@ -109,7 +109,7 @@ class HeightTracker:
             gate_m=_ground_gate_m(vertical),
             seen_spread_m=self._highest_m,
             lean=self._tilt.lean,
-            tilt_information=np.asarray(np.linalg.inv(self._tilt.p), np.float64),
+            tilt_information=self._tilt.information,
             shift_information=np.asarray(np.linalg.inv(shift), np.float64),
         )
 

@@ -31,12 +31,20 @@ class Tilt:
         self.offset = np.zeros(2)
         self.lean = np.zeros(2)
         self.p = np.diag([SIGMA_RAD**2, SIGMA_RAD**2, FLOOR_RAD**2, FLOOR_RAD**2])
+        self._information: Array | None = None  # of p as it is now, once it was asked for
         self._place = np.zeros(3)
         self._way_m, self._way_variance = 0.0, 0.0  # over ground; sum of the tilt's variance over it
         # how many times the variance of independent points the bumps add, by points
         self._shared, self._points = 0.0, 0.0
         self._at_last = 0.0  # variance of the tilt by the walls last seen, were their points independent
         self._alone = 0.0  # the same of the walls that the lean is believed of
+
+    @property
+    def information(self) -> Array:
+        """(4, 4) inverse of p."""
+        if self._information is None:
+            self._information = np.asarray(np.linalg.inv(self.p), np.float64)
+        return self._information
 
     def carry(self, dt_s: float, place: Array) -> None:
         """On to the next scan, from place (3,), map: the attitude's error wanders and is drawn back to 0, other bumps come
@@ -54,6 +62,7 @@ class Tilt:
         self.offset, self.lean = self.offset * kept, self.lean * same
         keep = np.array([kept, kept, same, same])
         self.p = self.p * np.outer(keep, keep) + np.diag([WALK**2 * dt_s, WALK**2 * dt_s, new, new])
+        self._information = None
 
     def drift_variance(self) -> float:
         """Of z, m2: the ground's map goes on as the tilt has it, so far off the start it is off by a sum of tilts, each the
@@ -65,7 +74,8 @@ class Tilt:
         """What the walls of a scan told."""
         self.offset = np.clip(self.offset + fit.correction[1:3], -MAX_RAD, MAX_RAD)
         self.lean = self.lean + fit.correction[3:]
-        self.p = np.asarray(np.linalg.inv(np.linalg.inv(self.p) + fit.information[1:, 1:]), np.float64)
+        self.p = np.asarray(np.linalg.inv(self.information + fit.information[1:, 1:]), np.float64)
+        self._information = None
         self.p[:2, :2] += np.eye(2) * FLOOR_RAD**2
         if fit.wall_points > 0:
             before = self._lean_variance()

@@ -1,7 +1,8 @@
 """The scans of a recording, registered by a process of its own, ahead of the replay that takes them in.
 
 What a scan gives depends on packets, attitude and rangefinder, never on what was made of the scans before it: so the same
-calls in the same order give it to the last bit, wherever they are made.
+calls in the same order give it to the last bit, wherever they are made. The replay decodes the packets, since it would
+wait meanwhile, and lays the scans where the other process finds them (scan_ring.py).
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ import fcntl
 import multiprocessing
 import os
 import pickle
+import select
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import NamedTuple
 
@@ -23,9 +25,11 @@ from companion.messages import LevelledScan, OdometryEstimate, WallRanges
 from companion.odometry import ScanResult
 from companion.odometry.estimate import Snapshot
 from companion.recording.run_types import Input
+from companion.recording.scan_ring import Arrival, ScanRing
 from companion.recording.scans import Accepted, ScansHere
 
 PIPE_BYTES = 1 << 20  # what Linux allows anybody: by how much the one may be ahead of the other
+WAIT_MS = 1  # until it is looked anew whether there is room for a scan
 _NONE = np.zeros(0, np.int64)
 _NOT_MAPPED = LevelledScan(
     t_ns=0, points_level=np.zeros((0, 3)), range_m=np.zeros(0), row=_NONE, column=_NONE, origin_level_m=np.zeros(3)
@@ -68,10 +72,9 @@ class Registered(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """After the last call. unmatched: begins without a scan. dropped: LiDAR packets, by why."""
+    """After the last call. unmatched: begins without a scan."""
 
     unmatched: int
-    dropped: dict[str, int]
 
 
 Told = Registered | Finished | None  # None: an accept without a scan
@@ -84,20 +87,25 @@ def is_worthwhile() -> bool:
 
 @dataclass(slots=True)
 class ScansAhead:
-    """A ScanSource: `told` brings what the other process registered. The odometry of `flight` then has no map."""
+    """A ScanSource: `results` brings what the other process registered. The odometry of `flight` then has no map."""
 
     flight: Flight
-    told: Iterator[Told]
+    feeder: Feeder
+    results: Connection
     unmatched: int = 0
+    _poll: select.poll = field(init=False, default_factory=select.poll)
+
+    def __post_init__(self) -> None:
+        self._poll.register(self.results.fileno(), select.POLLIN)
 
     def lidar(self, item: Input) -> None:
-        """The other process has it."""
+        """The feeder has it."""
 
     def begin(self, t_ns: int) -> None:
         """The other process does."""
 
     def accept(self) -> Accepted | None:
-        told = next(self.told)
+        told = self._next()
         if not isinstance(told, Registered):
             return None
         odometry = self.flight.odometry
@@ -110,10 +118,57 @@ class ScansAhead:
         return Accepted(None if told.found is None else told.found.result())
 
     def finish(self) -> None:
-        finished = next(self.told)
+        finished = self._next()
         assert isinstance(finished, Finished)
         self.unmatched = finished.unmatched
-        self.flight.decoder.dropped.update(finished.dropped)
+
+    def _next(self) -> Told:
+        """What the other process tells next; scans are decoded for it while there is nothing yet."""
+        self.feeder.keep_ahead()
+        while not self._poll.poll(0):
+            if not self.feeder.feed():
+                self._poll.poll(None if self.feeder.is_done else WAIT_MS)
+        try:
+            told: Told = pickle.loads(self.results.recv_bytes())
+        except EOFError:
+            raise RuntimeError("the process that registers scans ahead ended early: its error is told above") from None
+        return told
+
+
+@dataclass(slots=True)
+class Feeder:
+    """Decodes the packets of a recording and lays the scans into the ring, as far as there is room."""
+
+    flight: Flight
+    inputs: Sequence[Input]
+    ring: ScanRing
+    is_done: bool = False
+    _scans: Iterator[Arrival] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._scans = self._decoded()
+
+    def keep_ahead(self) -> None:
+        """At most two scans: one is taken meanwhile."""
+        for _ in range(2):
+            if 2 * self.ring.waiting < self.ring.places:
+                self.feed()
+
+    def feed(self) -> bool:
+        """One scan more, or the end. False: no room, or all is told."""
+        if self.is_done or self.ring.waiting >= self.ring.places:
+            return False
+        scan = next(self._scans, None)
+        self.is_done = scan is None
+        with contextlib.suppress(BrokenPipeError):  # it ended early: told where its results are taken
+            self.ring.put(scan)
+        return True
+
+    def _decoded(self) -> Iterator[Arrival]:
+        for index, item in enumerate(self.inputs):
+            if item.kind == "lidar":
+                for scan in self.flight.on_lidar_packet(item.data, item.t_ns, item.source):
+                    yield Arrival(index, scan)
 
 
 @contextlib.contextmanager
@@ -122,34 +177,39 @@ def registering(flight: Flight, inputs: Sequence[Input]) -> Iterator[ScansAhead]
     ours, theirs = multiprocessing.Pipe(duplex=False)
     with contextlib.suppress(OSError):
         fcntl.fcntl(theirs.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-    process = multiprocessing.get_context("fork").Process(target=_work, args=(flight, inputs, theirs), daemon=True)
+    ring = ScanRing(flight.decoder.geometry)
+    process = multiprocessing.get_context("fork").Process(
+        target=_work, args=(flight, inputs, ring, theirs), daemon=True
+    )
     process.start()
     theirs.close()
+    ring.is_put_here()
     try:
-        yield ScansAhead(flight, _received(ours))
+        yield ScansAhead(flight, Feeder(flight, inputs, ring), ours)
     finally:
         ours.close()
         process.kill()  # it leaves nothing behind, and may have the handler of SIGTERM of the program that it is a copy of
         process.join()
+        ring.close()
 
 
-def _received(ours: Connection) -> Iterator[Told]:
-    with contextlib.suppress(EOFError):
-        while True:
-            yield pickle.loads(ours.recv_bytes())
-    raise RuntimeError("the process that registers scans ahead ended early: its error is told above")
+def _work(flight: Flight, inputs: Sequence[Input], ring: ScanRing, theirs: Connection) -> None:
+    ring.is_taken_here()
+    register(flight, inputs, ring.taken(), lambda told: theirs.send_bytes(pickle.dumps(told, pickle.HIGHEST_PROTOCOL)))
 
 
-def _work(flight: Flight, inputs: Sequence[Input], theirs: Connection) -> None:
-    register(flight, inputs, lambda told: theirs.send_bytes(pickle.dumps(told, pickle.HIGHEST_PROTOCOL)))
-
-
-def register(flight: Flight, inputs: Sequence[Input], tell: Callable[[Told], None]) -> None:
-    """The calls that scans depend on: all but what the beats of estimates and setpoints do."""
+def register(
+    flight: Flight, inputs: Sequence[Input], arrivals: Iterator[Arrival], tell: Callable[[Told], None]
+) -> None:
+    """The calls that scans depend on: all but what the beats of estimates and setpoints do. arrivals: the scans, and at
+    which of the inputs each was complete."""
     scans = ScansHere(flight)
-    for item in inputs:
+    arrival = next(arrivals, None)
+    for index, item in enumerate(inputs):
         if item.kind == "lidar":
-            scans.lidar(item)
+            while arrival is not None and arrival.index == index:
+                scans.arrived(arrival.scan)
+                arrival = next(arrivals, None)
         elif item.kind == "mavlink":
             flight.on_mavlink(item.data, item.t_ns, item.source)
         elif item.kind == "poll":
@@ -158,14 +218,15 @@ def register(flight: Flight, inputs: Sequence[Input], tell: Callable[[Told], Non
             scans.begin(item.t_ns)
         elif item.kind == "accept":
             accepted = scans.accept()
-            tell(None if accepted is None else _accept(flight, accepted.result, item.t_ns))
-    tell(Finished(scans.unmatched, flight.decoder.dropped))
+            tell(None if accepted is None else _accept(flight, accepted.result))
+    tell(Finished(scans.unmatched))
 
 
-def _accept(flight: Flight, result: ScanResult | None, t_ns: int) -> Registered:
-    belongs = flight.accept_scan(result, t_ns)
+def _accept(flight: Flight, result: ScanResult | None) -> Registered:
+    flight.odometry.publish()
     found = None
     if result is not None:
+        belongs = flight.belongs_in_map(result.estimate)
         found = Found(
             result.estimate, result.levelled if belongs else None, result.wall_ranges,
             result.is_standing, result.is_yaw_weak, result.tilt_offset_rad,

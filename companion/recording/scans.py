@@ -48,7 +48,12 @@ class ScansHere:
     _jobs: deque[Callable[[], ScanResult | None]] = field(init=False, default_factory=deque)
 
     def lidar(self, item: Input) -> None:
-        self._scans.extend(self.flight.on_lidar_packet(item.data, item.t_ns, item.source))
+        for scan in self.flight.on_lidar_packet(item.data, item.t_ns, item.source):
+            self.arrived(scan)
+
+    def arrived(self, scan: LidarScan) -> None:
+        """A scan that is decoded."""
+        self._scans.append(scan)
 
     def begin(self, t_ns: int) -> None:
         if self._scans:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from companion.flight import Flight
-from companion.recording import ahead
+from companion.recording import ahead, scan_ring
 from companion.recording.replay import Replay
 from companion.recording.run_files import read_run
 from companion.recording.run_types import Input
@@ -61,6 +61,28 @@ def test_ahead_is_the_same_as_here(lost: str) -> None:
     assert other.flight.decoder.dropped == here.flight.decoder.dropped
     assert other.flight.mapper.size == here.flight.mapper.size
     assert (here.flight.mapper.size > 1000) == (lost != "all packets")
+
+
+def test_a_ring_of_two_places_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans without an accept are taken on the other side while the replay waits for room: neither waits for good."""
+    monkeypatch.setattr(scan_ring, "MOST_PLACES", 2)
+    replays = []
+    for is_ahead in (False, True):
+        flight, inputs = recorded()
+        accepts = itertools.count()
+        inputs = [item for item in inputs if item.kind != "accept" or next(accepts) % 5 == 0]
+        replay = Replay(flight)
+        if is_ahead:
+            with ahead.registering(flight, inputs) as replay.scans:
+                assert replay.scans.feeder.ring.places == 2
+                replay.run(inputs)
+        else:
+            replay.run(inputs)
+        replays.append(replay)
+    here, other = replays
+    assert len(here.frames) > 100
+    assert other.frames == here.frames
+    assert other.flight.mapper.size == here.flight.mapper.size
 
 
 def test_a_process_that_ends_early_is_told_and_not_taken_for_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
