@@ -207,7 +207,7 @@ def register(
     arrival = next(arrivals, None)
     for index, item in enumerate(inputs):
         if item.kind == "lidar":
-            while arrival is not None and arrival.index == index:
+            while arrival is not None and arrival.call == index:
                 scans.arrived(arrival.scan)
                 arrival = next(arrivals, None)
         elif item.kind == "mavlink":

@@ -19,14 +19,14 @@ from companion.messages import LidarGeometry, LidarScan
 MOST_PLACES = 64
 MOST_BYTES = 64 << 20
 _HEAD_BYTES = 64  # how many were taken; a cache line of its own
-_NOTE = struct.Struct("<qqq")  # index, t_ns, frame id
+_NOTE = struct.Struct("<qqq")  # call, t_ns, frame id
 _END = -1
 
 
 class Arrival(NamedTuple):
-    """A scan, and the index of the recorded call that completed it."""
+    """A scan, and which of the recorded calls completed it."""
 
-    index: int
+    call: int
     scan: LidarScan
 
 
@@ -70,24 +70,24 @@ class ScanRing:
         if arrival is None:
             self._noted.send_bytes(_NOTE.pack(_END, 0, 0))
             return
-        index, scan = arrival
+        call, scan = arrival
         place = self._places[self._put % self.places]
         place["t_column_ns"], place["range_m"] = scan.t_column_ns, scan.range_m
         place["signal"], place["column_valid"] = scan.signal, scan.column_valid
         self._put += 1
-        self._noted.send_bytes(_NOTE.pack(index, scan.t_ns, scan.frame_id))
+        self._noted.send_bytes(_NOTE.pack(call, scan.t_ns, scan.frame_id))
 
     def taken(self) -> Iterator[Arrival]:
         """Each scan that was put, in order, until there are no more or the other process has ended."""
         with contextlib.suppress(EOFError):
             while True:
-                index, t_ns, frame_id = _NOTE.unpack(self._notes.recv_bytes())
-                if index == _END:
+                call, t_ns, frame_id = _NOTE.unpack(self._notes.recv_bytes())
+                if call == _END:
                     return
                 place = self._places[int(self._taken[0]) % self.places].copy()
                 self._taken[0] += 1
                 yield Arrival(
-                    index,
+                    call,
                     LidarScan(
                         t_ns=t_ns,
                         frame_id=frame_id,

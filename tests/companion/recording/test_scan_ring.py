@@ -54,11 +54,11 @@ def test_each_scan_arrives_as_it_was_put(rows: int, columns: int) -> None:
             assert ring.waiting == 2
             for sent in put[n - 1 : n + 1]:
                 got = next(coming)
-                assert got.index == sent.index
+                assert got.call == sent.call
                 assert same(got.scan, sent.scan)
                 assert all(a.flags.aligned and a.flags.c_contiguous for a in (got.scan.range_m, got.scan.t_column_ns))
     ring.put(None)
-    assert [got.index for got in coming] == [put[-1].index]
+    assert [got.call for got in coming] == [put[-1].call]
 
 
 def test_what_was_taken_stays_when_its_place_is_used_again() -> None:
@@ -93,4 +93,4 @@ def test_the_end_of_the_other_process_is_an_end() -> None:
     ring = ScanRing(shape)
     ring.put(Arrival(5, scan(shape, 1)))
     ring.is_taken_here()
-    assert [got.index for got in ring.taken()] == [5]
+    assert [got.call for got in ring.taken()] == [5]
