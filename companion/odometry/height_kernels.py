@@ -20,7 +20,11 @@ A, BX, BY, CX, CY, ABOUT, SXX, SXY, SYY, WEIGHT, PZ = range(11)
 PLANE = 11
 DIRTY, VALID, NO_PLANE = 0, 1, 2
 MIN_WEIGHT = 4.0
+HEAP_SLOPE = 0.15  # of a plane, from which on it may be a heap's: round
+MIN_OWN_WEIGHT = 4.0  # of a cell there whose plane goes through its own points' mean
+MIN_OWN_RATIO = 0.06  # of the window's; a ninth where points lie evenly. Few lie where noise along the beams threw them
 SLOPE_SIGMA = 0.5  # of slopes where nothing is known of them; material lies at up to 0.8
+SLOPE_M = 0.1  # by how much more a slope's points are unsure of z, for each metre that it rises in one: where the body is
 LEAN_M2 = 0.012  # spread along the beam that is noise and must not pass for slope
 SURFACE_SIGMA_M = 0.03
 TILT_FAR_RAD = 0.0015  # attitude error that a far point's height is thought to carry into the map
@@ -83,7 +87,11 @@ def insert_heights(
 
 @kernel
 def fit_plane(sums: Array, state: NDArray[np.uint8], planes: Array, iy: int, ix: int) -> None:
-    """Fit the window about a cell anew: a plane whose slopes are held near 0 where the points do not tell them."""
+    """Fit the window about a cell anew: a plane whose slopes are held near 0 where the points do not tell them.
+
+    On a slope it goes through the mean of the cell's own points where these are enough: heaps are round, and the mean of the
+    window lies centimetres under its middle; the body would be held lower wherever a heap is in sight.
+    """
     ny, nx = state.shape
     t = np.zeros(SUMS)
     for jy in range(max(0, iy - WINDOW), min(ny, iy + WINDOW + 1)):
@@ -106,11 +114,15 @@ def fit_plane(sums: Array, state: NDArray[np.uint8], planes: Array, iy: int, ix:
     bx = ((syy + ridge) * sxz - sxy * syz) / det
     by = ((sxx + ridge) * syz - sxy * sxz) / det
     about = szz - 2 * (bx * sxz + by * syz) + bx * bx * sxx + 2 * bx * by * sxy + by * by * syy
+    own, weight = sums[iy, ix], w
+    if bx * bx + by * by > HEAP_SLOPE**2 and own[W] >= max(MIN_OWN_WEIGHT, MIN_OWN_RATIO * w):
+        weight = own[W]
+        mx, my, mz = own[X] / weight, own[Y] / weight, own[Z] / weight
     p = planes[iy, ix]
     p[A], p[BX], p[BY], p[CX], p[CY] = mz, bx, by, mx, my
     p[ABOUT] = max(about, 1e-4)
     p[SXX], p[SXY], p[SYY] = noise / w * (syy + ridge) / det, -noise / w * sxy / det, noise / w * (sxx + ridge) / det
-    p[WEIGHT], p[PZ] = w, t[VZ] / w
+    p[WEIGHT], p[PZ] = weight, t[VZ] / w
     state[iy, ix] = VALID
 
 
@@ -235,7 +247,8 @@ def _ground_rows(
         res[k] = z_m + pz - (p[A] + p[BX] * dx + p[BY] * dy) + jac[k, 1] * tilt[0] + jac[k, 2] * tilt[1]
         along = (pz - bx * px - by * py) / max(math.sqrt(px * px + py * py + pz * pz), 1e-6)
         plane = p[ABOUT] / p[WEIGHT] + dx * dx * p[SXX] + 2 * dx * dy * p[SXY] + dy * dy * p[SYY]
-        var[k] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * plane
+        unsure = SURFACE_SIGMA_M**2 + SLOPE_M**2 * (bx * bx + by * by)
+        var[k] = (sigma_range_m * along) ** 2 + unsure + CORRELATED * plane
         pose_variance += p[PZ]
         k += 1
     return jac, res, var, pose_variance / max(k, 1)

@@ -169,3 +169,22 @@ def test_what_the_ground_tells_narrows_that_axis_only_and_is_not_believed_when_i
     assert weak.sigma_along(held, np.array([-0.8, 0.6])) == pytest.approx(0.2)
     assert weak.held_by_ground(state, axis, 2.0, 2500.0) is state
     assert weak.held_by_ground(state, axis, 0.2, 4.0) is state
+
+
+def test_a_heap_does_not_lie_lower_in_the_map_than_it_is() -> None:
+    """It is round: the mean of a window lies under its middle, and a fit to that held the body lower beside heaps."""
+    rng = np.random.default_rng(6)
+    ground, far = HeightMap(), np.array([12.0, 0.0, 8.0])
+    places = rng.uniform(-7.0, 7.0, (40_000, 2))
+    heights = np.maximum(3.5 - 0.7 * np.hypot(places[:, 0], places[:, 1]), 0.0)
+    sight = np.column_stack([places, heights]) - far
+    ground.insert(np.column_stack([sight, np.full(len(sight), RETURNS)]), far, np.zeros(3), 0.0, 0.0)
+    asked = rng.uniform(-4.0, 4.0, (2000, 2))
+    radius = np.hypot(asked[:, 0], asked[:, 1])
+    flank = asked[(radius > 1.5) & (radius < 4.0)]
+    errors = []
+    for x, y in flank:
+        known = ground.height_at(x, y)
+        assert known is not None
+        errors.append(known[0] - (3.5 - 0.7 * math.hypot(x, y)))
+    assert np.mean(errors) == pytest.approx(0.0, abs=0.003)  # it was -0.022
