@@ -100,6 +100,7 @@ class Flight:
     _sent: Setpoint | None = field(init=False, default=None)
     _computer_not_ready: tuple[str, ...] = field(init=False, default=())
     _sent_odometry_ns: int | None = field(init=False, default=None)
+    _resets_at_loss: int | None = field(init=False, default=None)
     _odometry_beat: _Beat = field(init=False)
     _setpoint_beat: _Beat = field(init=False)
 
@@ -180,7 +181,7 @@ class Flight:
             estimate = self.odometry.predict(t_ns)
             if estimate is not None:
                 self.estimate = estimate
-                if not self.guard.is_silent:
+                if not self.guard.is_silent and not self._is_jump_in_blind_landing(estimate):
                     self._send_odometry(estimate, t_ns)
                 self.tap(topics.ESTIMATE, t_ns, estimate)
         if self._setpoint_beat.due(t_ns):
@@ -239,6 +240,16 @@ class Flight:
         if self._sent_odometry_ns is not None and self.session.is_armed:
             self.odometry_max_gap_s = max(self.odometry_max_gap_s, (t_ns - self._sent_odometry_ns) * 1e-9)
         self._sent_odometry_ns = t_ns
+
+    def _is_jump_in_blind_landing(self, estimate: OdometryEstimate) -> bool:
+        """Whether a place was found anew after the landing for want of one had begun. It is not told: if it is false, the
+        flight controller flies after it (in a hall of 120 m, at 18 m/s into the end wall); without vision it comes down."""
+        if self.navigation is None or not self.navigation.lands_blind:
+            self._resets_at_loss = None
+            return False
+        if self._resets_at_loss is None:
+            self._resets_at_loss = estimate.reset_counter
+        return estimate.reset_counter != self._resets_at_loss
 
     def _navigate(self, t_ns: int) -> None:
         state: VehicleState = self.session.vehicle_state(t_ns)

@@ -70,6 +70,7 @@ class NavigatorOutput:
     setpoint: None when the companion must not stream (before arming, after the pilot took over).
     is_straight: following a straight wall, not turning. progress_ratio: of the laps, by angle gone round.
     outcome: "completed", or in one word why not; "" while flying. reason: the same for people.
+    lands_blind: it lands where it is, since nothing holds its position.
     """
 
     setpoint: Setpoint | None
@@ -83,3 +84,4 @@ class NavigatorOutput:
     path_length_m: float
     outcome: str
     reason: str
+    lands_blind: bool

@@ -399,4 +399,5 @@ class Navigator:
             is_straight=turning is not None and turning.is_straight,
             progress_ratio=min(1.0, (self._laps_closed + share) / self._cfg.laps),
             path_length_m=self._path.length_m, outcome=self._outcome if over else "", reason=self._reason,
+            lands_blind=self.state is S.LAND and self._outcome == "vision_lost",
         )  # fmt: skip

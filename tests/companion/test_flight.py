@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
 from companion.config import CompanionConfig
 from companion.flight import Flight
 from companion.mavlink.computer import ComputerStatus
-from companion.messages import Event
+from companion.messages import Event, OdometryEstimate
+from companion.recording.replay import Replay
+from companion.recording.run_files import read_run
 from companion.topics import EVENT, Topic
+from stockpilot.replay import recorded_config
+from stockpilot.replay_edit import rebuild_scans
+
+CORNER = Path(__file__).resolve().parents[2] / "missions" / "replays" / "corner" / "recording.packed.xz"
+ODOMETRY = (331).to_bytes(3, "little")  # message id in a MAVLink 2 header
 
 MS = 1_000_000
 
@@ -42,3 +53,33 @@ def test_without_a_recording_the_disk_may_be_full() -> None:
     flight = Flight(CompanionConfig.model_validate({"recording": {"enabled": False}}))
     flight.on_computer(status(0.0))
     assert flight._computer_not_ready == ()
+
+
+def odometry_sent(*, lands_blind: bool, jumps: bool) -> int:
+    """How many estimates a recorded flight sends, were it landing for want of a position from its 100th step on and were its
+    place found anew at the 200th estimate."""
+    recording = read_run(CORNER)
+    metadata = recording.attachments["lidar.json"].decode()
+    flight = Flight(recorded_config(recording), lidar_metadata_json=metadata)
+    steps, predictions = itertools.count(), itertools.count()
+    step, predict = flight.navigator.step, flight.odometry.predict
+    flight.navigator.step = lambda t, i: replace(step(t, i), lands_blind=lands_blind and next(steps) > 100)  # type: ignore[method-assign]
+
+    def predicted(t_ns: int) -> OdometryEstimate | None:
+        estimate = predict(t_ns)
+        if estimate is None or not jumps or next(predictions) < 200:
+            return estimate
+        return replace(estimate, reset_counter=estimate.reset_counter + 1)
+
+    flight.odometry.predict = predicted  # type: ignore[method-assign]
+    replay = Replay(flight)
+    replay.run(rebuild_scans(recording.inputs, metadata))
+    return sum(frame[7:10] == ODOMETRY for _, frame in replay.frames)
+
+
+def test_a_place_found_anew_in_a_blind_landing_is_not_told_to_the_flight_controller() -> None:
+    """It flew after a false one at 18 m/s, into the end wall of a hall of 120 m."""
+    usual = odometry_sent(lands_blind=False, jumps=True)
+    assert usual > 300
+    assert odometry_sent(lands_blind=True, jumps=False) == usual
+    assert 100 < odometry_sent(lands_blind=True, jumps=True) < usual - 100
