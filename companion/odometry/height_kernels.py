@@ -24,9 +24,7 @@ HEAP_SLOPE = 0.15  # of a plane, from which on it may be a heap's: round
 MIN_OWN_WEIGHT = 4.0  # of a cell there whose plane goes through its own points' mean
 MIN_OWN_RATIO = 0.06  # of the window's; a ninth where points lie evenly. Few lie where noise along the beams threw them
 SLOPE_SIGMA = 0.5  # of slopes where nothing is known of them; material lies at up to 0.8
-SLOPE_M = (
-    0.1  # by how much more a slope's points are unsure of z, for each metre that it rises in one: where the body is
-)
+SLOPE_M = 0.1  # by how much a slope's points are unsure of z, for each metre that it rises in one: where the body is
 LEAN_M2 = 0.012  # spread along the beam that is noise and must not pass for slope
 SURFACE_SIGMA_M = 0.03
 TILT_FAR_RAD = 0.0015  # attitude error that a far point's height is thought to carry into the map

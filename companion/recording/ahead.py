@@ -183,7 +183,7 @@ def registering(flight: Flight, inputs: Sequence[Input]) -> Iterator[ScansAhead]
     )
     process.start()
     theirs.close()
-    ring.is_put_here()
+    ring.put_only_here()
     try:
         yield ScansAhead(flight, Feeder(flight, inputs, ring), ours)
     finally:
@@ -194,7 +194,7 @@ def registering(flight: Flight, inputs: Sequence[Input]) -> Iterator[ScansAhead]
 
 
 def _work(flight: Flight, inputs: Sequence[Input], ring: ScanRing, theirs: Connection) -> None:
-    ring.is_taken_here()
+    ring.take_only_here()
     register(flight, inputs, ring.taken(), lambda told: theirs.send_bytes(pickle.dumps(told, pickle.HIGHEST_PROTOCOL)))
 
 

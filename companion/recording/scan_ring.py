@@ -56,10 +56,10 @@ class ScanRing:
     def waiting(self) -> int:
         return self._put - int(self._taken[0])
 
-    def is_put_here(self) -> None:
+    def put_only_here(self) -> None:
         self._notes.close()
 
-    def is_taken_here(self) -> None:
+    def take_only_here(self) -> None:
         self._noted.close()
 
     def close(self) -> None:

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from companion.config import CompanionConfig
 from companion.flight import Flight
+from companion.mavlink import wire
 from companion.mavlink.computer import ComputerStatus
 from companion.messages import Event, OdometryEstimate
 from companion.recording.replay import Replay
-from companion.recording.run_files import read_run
 from companion.topics import EVENT, Topic
-from stockpilot.replay import recorded_config
-from stockpilot.replay_edit import rebuild_scans
+from tests.companion.recording.corner import recorded
 
-CORNER = Path(__file__).resolve().parents[2] / "missions" / "replays" / "corner" / "recording.packed.xz"
-ODOMETRY = (331).to_bytes(3, "little")  # message id in a MAVLink 2 header
+ODOMETRY = wire.ODOMETRY.to_bytes(3, "little")  # as in a MAVLink 2 header
 
 MS = 1_000_000
 
@@ -58,9 +55,7 @@ def test_without_a_recording_the_disk_may_be_full() -> None:
 def odometry_sent(*, lands_blind: bool, jumps: bool) -> int:
     """How many estimates a recorded flight sends, were it landing for want of a position from its 100th step on and were its
     place found anew at the 200th estimate."""
-    recording = read_run(CORNER)
-    metadata = recording.attachments["lidar.json"].decode()
-    flight = Flight(recorded_config(recording), lidar_metadata_json=metadata)
+    flight, inputs = recorded()
     steps, predictions = itertools.count(), itertools.count()
     step, predict = flight.navigator.step, flight.odometry.predict
     flight.navigator.step = lambda t, i: replace(step(t, i), lands_blind=lands_blind and next(steps) > 100)  # type: ignore[method-assign]
@@ -73,7 +68,7 @@ def odometry_sent(*, lands_blind: bool, jumps: bool) -> int:
 
     flight.odometry.predict = predicted  # type: ignore[method-assign]
     replay = Replay(flight)
-    replay.run(rebuild_scans(recording.inputs, metadata))
+    replay.run(inputs)
     return sum(frame[7:10] == ODOMETRY for _, frame in replay.frames)
 
 

@@ -6,27 +6,32 @@ import itertools
 import os
 import signal
 import time
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
-from companion.flight import Flight
 from companion.recording import ahead, scan_ring
 from companion.recording.replay import Replay
-from companion.recording.run_files import read_run
-from companion.recording.run_types import Input
-from stockpilot.replay import recorded_config
-from stockpilot.replay_edit import rebuild_scans
-
-CORNER = Path(__file__).resolve().parents[3] / "missions" / "replays" / "corner" / "recording.packed.xz"
+from tests.companion.recording.corner import recorded
 
 
-def recorded() -> tuple[Flight, list[Input]]:
-    recording = read_run(CORNER)
-    metadata = recording.attachments["lidar.json"].decode()
-    return Flight(config=recorded_config(recording), lidar_metadata_json=metadata), rebuild_scans(
-        recording.inputs, metadata
-    )
+def both_ways(kind: str, is_kept: Callable[[int], bool]) -> tuple[Replay, Replay]:
+    """The recorded flight, of its calls of a kind only those kept, by number: scans registered here, and by a process ahead."""
+    replays = []
+    for is_ahead in (False, True):
+        flight, inputs = recorded()
+        count = itertools.count()
+        inputs = [item for item in inputs if item.kind != kind or is_kept(next(count))]
+        replay = Replay(flight)
+        if is_ahead:
+            with ahead.registering(flight, inputs) as replay.scans:
+                replay.run(inputs)
+        else:
+            replay.run(inputs)
+        replays.append(replay)
+    here, other = replays
+    assert len(here.frames) > 100
+    return here, other
 
 
 LOST = {
@@ -39,21 +44,8 @@ LOST = {
 
 @pytest.mark.parametrize("lost", LOST)
 def test_ahead_is_the_same_as_here(lost: str) -> None:
-    replays = []
-    for is_ahead in (False, True):
-        flight, inputs = recorded()
-        kind, every = LOST[lost]
-        count = itertools.count()
-        inputs = [item for item in inputs if item.kind != kind or next(count) % every]
-        replay = Replay(flight)
-        if is_ahead:
-            with ahead.registering(flight, inputs) as replay.scans:
-                replay.run(inputs)
-        else:
-            replay.run(inputs)
-        replays.append(replay)
-    here, other = replays
-    assert len(here.frames) > 100
+    kind, every = LOST[lost]
+    here, other = both_ways(kind, lambda n: n % every != 0)
     assert other.frames == here.frames
     assert other.messages == here.messages
     assert other.unmatched == here.unmatched
@@ -66,21 +58,9 @@ def test_ahead_is_the_same_as_here(lost: str) -> None:
 def test_a_ring_of_two_places_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scans without an accept are taken on the other side while the replay waits for room: neither waits for good."""
     monkeypatch.setattr(scan_ring, "MOST_PLACES", 2)
-    replays = []
-    for is_ahead in (False, True):
-        flight, inputs = recorded()
-        accepts = itertools.count()
-        inputs = [item for item in inputs if item.kind != "accept" or next(accepts) % 5 == 0]
-        replay = Replay(flight)
-        if is_ahead:
-            with ahead.registering(flight, inputs) as replay.scans:
-                assert replay.scans.feeder.ring.places == 2
-                replay.run(inputs)
-        else:
-            replay.run(inputs)
-        replays.append(replay)
-    here, other = replays
-    assert len(here.frames) > 100
+    here, other = both_ways("accept", lambda n: n % 5 == 0)
+    assert isinstance(other.scans, ahead.ScansAhead)
+    assert other.scans.feeder.ring.places == 2
     assert other.frames == here.frames
     assert other.flight.mapper.size == here.flight.mapper.size
 

@@ -83,7 +83,7 @@ def test_room_is_limited_by_places_and_by_bytes() -> None:
 def test_nobody_there_to_take_is_told() -> None:
     shape = geometry(2, 8)
     ring = ScanRing(shape)
-    ring.is_put_here()
+    ring.put_only_here()
     with pytest.raises(BrokenPipeError):
         ring.put(Arrival(0, scan(shape, 0)))
 
@@ -92,5 +92,5 @@ def test_the_end_of_the_other_process_is_an_end() -> None:
     shape = geometry(2, 8)
     ring = ScanRing(shape)
     ring.put(Arrival(5, scan(shape, 1)))
-    ring.is_taken_here()
+    ring.take_only_here()
     assert [got.call for got in ring.taken()] == [5]
