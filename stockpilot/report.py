@@ -27,8 +27,8 @@ CAPTIONS = {
 }
 PARTS = {
     "returns": "noise of single returns",
-    "position": "horizontal error of the poses",
-    "height": "vertical error of the poses",
+    "poses": "errors of the poses, as stretches of the flight differ",
+    "turns": "turns that round walls do not show",
     "range": "offset of the sensor's range",
     "floor": "the floor under the pile",
     "walls": "where the pile meets the walls",

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from companion.jit import kernel
 from companion.messages import Array, PointMap
-from companion.volume.grid import Grid, Index, Mask, local_planes
+from companion.volume.grid import Grid, Index, Mask, cells_of, disc, local_planes
 from companion.volume.surface import MIN_POINTS, Cells
 
 PASSES = 3  # the surface moves by less than a millimetre in the fourth
@@ -24,6 +24,8 @@ STEPS = 3  # of a beam's way to the surface
 FURTHEST_SIGMA = 4.0  # a return farther from the surface is not of it
 GRAZING = 0.1  # least change of height above the surface for a metre of beam
 LEAST_NOISE_M = 0.005
+LEAST_BEAMS = 2  # that meet a cell, for a height of it: one alone is as far off as its noise
+BRIDGED_M = 0.75  # to either side of a cell
 WHOLE_SIGMA = 3.0  # so near to where returns were left out, some that belong to a cell are missing
 
 
@@ -44,11 +46,15 @@ def where_beams_meet(point_map: PointMap, cells: Cells, grid: Grid, wanted: Mask
     for _ in range(PASSES):
         planes = local_planes(grid, met.x, met.y, met.z, np.minimum(met.kept, 20.0), radius_cells=1)
         known = np.isfinite(planes.z_m) & met.seen
-        sums = _gather(
+        sums, cell, above = _gather(
             points, beams, cell_of, known, planes.z_m, planes.slope_x, planes.slope_y, place, FURTHEST_SIGMA * noise_m,
         )  # fmt: skip
         met = _moved(met, sums, grid, whole)
-    return met
+    meets_in, above_m = np.full(len(cells.of_point), -1, dtype=np.int64), np.zeros(len(cells.of_point))
+    meets_in[index], above_m[index] = cell, above
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigma = np.where(met.seen, cells.sigma_m * np.sqrt(cells.kept / met.kept), np.nan)
+    return replace(met, sigma_m=sigma, meets_in=meets_in, above_m=above_m)
 
 
 def _moved(cells: Cells, sums: Array, grid: Grid, whole: Mask) -> Cells:
@@ -56,14 +62,17 @@ def _moved(cells: Cells, sums: Array, grid: Grid, whole: Mask) -> Cells:
     with np.errstate(invalid="ignore", divide="ignore"):
         x, y, z = (sums[..., k] / n for k in (1, 2, 3))
         rise = sums[..., 4] / n
-    use = whole & (n >= MIN_POINTS)
+    use = whole & (n >= LEAST_BEAMS)
+    # Between two that beams meet, what came where none does was thrown there by its noise: a straight line is better.
+    # Wider gaps may hide a foot, which no straight line follows.
+    none = whole & ~use & ndimage.binary_closing(use, disc(cells_of(BRIDGED_M, grid)))
     cx, cy = grid.centres()
     return replace(
         cells,
-        x=np.where(use, x + cx, cells.x),
-        y=np.where(use, y + cy, cells.y),
-        z=np.where(use, z, cells.z),
-        kept=np.where(use, n, cells.kept),
+        x=np.where(none, np.nan, np.where(use, x + cx, cells.x)),
+        y=np.where(none, np.nan, np.where(use, y + cy, cells.y)),
+        z=np.where(none, np.nan, np.where(use, z, cells.z)),
+        kept=np.where(none, 0.0, np.where(use, np.maximum(n, MIN_POINTS), cells.kept)),
         rise=np.where(n >= MIN_POINTS, rise, np.nan),
     )
 
@@ -79,15 +88,17 @@ def _gather(
     slope_y: Array,
     grid: Array,
     furthest_m: float,
-) -> Array:
+) -> tuple[Array, Index, Array]:
     """(ny, nx, 5): how many beams meet each cell; times that: their mean place from its centre (2), height, and how fast
-    that rises with their ranges.
+    that rises with their ranges. (N,): flat cell in which each beam meets the surface, -1 where it does not; how far its
+    return then lies above the plane, m.
 
     points, beams: (N, 3), unit. cell_of: (N,) flat cells where they came. known, z, slope_x, slope_y: (ny, nx) planes at the
     cells' centres. grid: x0, y0, cell.
     """
     ny, nx = z.shape
     sums = np.zeros((ny, nx, 5))
+    cell, over = np.full(len(points), -1), np.zeros(len(points))
     for n in range(len(points)):
         i, j = cell_of[n] // nx, cell_of[n] % nx
         if not known[i, j]:
@@ -122,4 +133,5 @@ def _gather(
         sums[i, j, 2] += dy
         sums[i, j, 3] += z[i, j] + slope_x[i, j] * dx + slope_y[i, j] * dy - along * rate
         sums[i, j, 4] += rate
-    return sums
+        cell[n], over[n] = i * nx + j, -along * rate
+    return sums, cell, over

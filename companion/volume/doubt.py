@@ -14,7 +14,8 @@ from scipy import ndimage
 
 from companion.messages import PointMap
 from companion.volume.floor import Floor
-from companion.volume.interval import Evidence
+from companion.volume.interval import Evidence, flank_m2
+from companion.volume.keyframes import DRIFTS
 from companion.volume.surface import Cells, CellState
 from companion.volume.walls import Footprint
 
@@ -77,13 +78,14 @@ def doubt(
             f"the keyframes disagree on the walls by {footprint.pose_sigma_m:.2f} m (1 sigma), "
             f"the odometry told {point_map.position_sigma_m:.2f} m: poses are not consistent"
         )
-    if e.floor_disagreement_m > FLOOR_DOUBLED_M:
+        extra.append(footprint.pose_sigma_m / math.sqrt(DRIFTS) * flank_m2(e))
+    if e.poses.floor_disagreement_m > FLOOR_DOUBLED_M:
         said.append(
-            f"the keyframes disagree on the floor by {e.floor_disagreement_m:.3f} m (1 sigma): "
+            f"the keyframes disagree on the floor by {e.poses.floor_disagreement_m:.3f} m (1 sigma): "
             "their heights or the attitude are off"
         )
         # An attitude that is off bends floor and pile alike all along the lap: that does not average out.
-        extra.append(e.floor_disagreement_m * pile_area)
+        extra.append(e.poses.floor_disagreement_m * pile_area)
     if cells.dropped_ratio > IN_THE_AIR:
         said.append(f"{100 * cells.dropped_ratio:.0f} % of the returns were not of the surface: dust, or poor poses")
         extra.append(0.1 * cells.dropped_ratio * abs(volume_m3))

@@ -16,10 +16,12 @@ BULGE_M = 4.0  # walls bulge over about so many metres
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EdgeFit:
-    """One straight stretch: a point on it, its direction, and how its returns lie about it."""
+    """One straight stretch: its middle, direction and length, and how its returns lie about it: offsets_m, outwards, of
+    the points `members`."""
 
     point: Array
     direction: Array
+    length_m: float
     noise_m: float
     waviness_m: float
     members: Index
@@ -96,6 +98,7 @@ def _fit_edge(a: Array, b: Array, points: Array, spread: float) -> EdgeFit | Non
     return EdgeFit(
         point=a + 0.5 * length * direction + offset * normal,
         direction=turned / np.hypot(*turned),
+        length_m=length,
         noise_m=sigma,
         waviness_m=_waviness(s[ok], r[ok], length),
         members=near[ok],
@@ -138,9 +141,9 @@ def _join(before: EdgeFit | None, after: EdgeFit | None, corner: Array) -> list[
     return [line.point + ((corner - line.point) @ line.direction) * line.direction for line in (before, after)]
 
 
-def pose_disagreement(fits: list[EdgeFit], keyframe: Index) -> tuple[float, float]:
-    """How far the keyframes disagree on where a wall is: single ones, and all together. NaN where too few see any."""
-    single2, lap2, weight = 0.0, 0.0, 0.0
+def pose_disagreement(fits: list[EdgeFit], keyframe: Index) -> float:
+    """How far single keyframes disagree on where a wall is, 1 sigma; NaN where too few see any."""
+    single2, weight = 0.0, 0.0
     for fit in fits:
         _, index = np.unique(keyframe[fit.members], return_inverse=True)
         n = np.bincount(index)
@@ -148,10 +151,6 @@ def pose_disagreement(fits: list[EdgeFit], keyframe: Index) -> tuple[float, floa
         if seen.sum() < LEAST_KEYFRAMES:
             continue
         means = np.bincount(index, fit.offsets_m)[seen] / n[seen]
-        single, lap = disagreement(means, float(np.mean(fit.noise_m**2 / n[seen])))
-        single2 += float(seen.sum()) * single**2
-        lap2 += float(seen.sum()) * lap**2
+        single2 += float(seen.sum()) * disagreement(means, float(np.mean(fit.noise_m**2 / n[seen]))) ** 2
         weight += float(seen.sum())
-    if not weight:
-        return float("nan"), float("nan")
-    return float(np.sqrt(single2 / weight)), float(np.sqrt(lap2 / weight))
+    return float(np.sqrt(single2 / weight)) if weight else float("nan")

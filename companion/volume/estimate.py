@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,11 +12,12 @@ from companion.messages import Array, PointMap, VolumeReport
 from companion.volume.beams import where_beams_meet
 from companion.volume.contact import Contact, fit_contact
 from companion.volume.doubt import doubt
-from companion.volume.floor import Floor, fit_floor, floor_beside, level_floor
+from companion.volume.floor import Floor, fit_floor, floor_around, floor_beside, level_floor, waves_m
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc, grid_around
 from companion.volume.interval import RIM_M, Evidence, error_budget, interval
-from companion.volume.keyframes import DRIFTS, LEAST_KEYFRAMES, disagreement, untold_turn
+from companion.volume.jackknife import cut_in_stretches
 from companion.volume.objects import find_objects
+from companion.volume.poses import pose_errors
 from companion.volume.shadow import Shadow, lay_hidden
 from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells, without_strays
 from companion.volume.walls import Footprint, find_footprint
@@ -135,11 +135,15 @@ def _report(
         warnings=(*footprint.warnings, *objects.warnings),
     )
     pile = pile_mask(height, footprint.share > 0, cells, floor, grid)
-    rise, rise_sigma = floor_beside(grid, floor, height, pile)
+    stretches = cut_in_stretches(point_map, grid, cells, surface, footprint.fit_keyframe)
+    halves = None if stretches is None else stretches.halves_m()
+    rise, rise_sigma = floor_beside(grid, floor, height, pile, halves)
+    waves = waves_m(grid, floor, height, halves)
     height, floor_z = height - rise, floor_z + rise
     area = grid.cell_area_m2 * footprint.share
     volume = float(np.sum((height * area)[pile]))
-    seen_by_all = floor_disagreement(point_map, cells, floor)
+    rings = [(own, ring if ring.any() else floor.cells) for own, ring in floor_around(grid, floor, pile)]
+    poses = pose_errors(point_map, grid, cells, surface, footprint, floor, stretches, area * pile, rings, height)
     evidence = Evidence(
         grid=grid,
         cells=cells,
@@ -148,16 +152,15 @@ def _report(
         contact=contact,
         floor=floor,
         rise_sigma_m=rise_sigma,
+        waves_m=waves,
         height_m=height,
         share=footprint.share,
         pile=pile,
         depth_m=footprint.depth_m,
-        has_walls=footprint.has_walls,
+        poses=poses,
         range_offset_sigma_m=cfg.range_offset_sigma_m,
-        told_sigma_m=point_map.position_sigma_m,
-        position_sigma_m=_position_sigma(point_map, footprint, grid, area * pile),
-        height_sigma_m=point_map.height_sigma_m / math.sqrt(DRIFTS) if seen_by_all is None else seen_by_all[1],
-        floor_disagreement_m=0.0 if seen_by_all is None else seen_by_all[0],
+        position_sigma_m=point_map.position_sigma_m,
+        height_sigma_m=point_map.height_sigma_m,
         wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, LEAST_WALL_SIGMA_M)) if footprint.has_walls else 0.0,
     )
     total = float(area.sum())
@@ -216,41 +219,6 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, floor: Floor, grid: Gri
     holds[0] = False
     core = holds[label]
     return np.asarray(ndimage.binary_dilation(core, disc(cells_of(RIM_M, grid))) & inside)
-
-
-def floor_disagreement(point_map: PointMap, cells: Cells, floor: Floor) -> tuple[float, float] | None:
-    """How far single keyframes disagree on the floor's height, and what that leaves of a lap, 1 sigma; None: too few see
-    it. A rise of the whole map changes no volume."""
-    on_floor = cells.of_point >= 0
-    on_floor[on_floor] = floor.cells.ravel()[cells.of_point[on_floor]]
-    index = np.flatnonzero(on_floor)
-    if len(index) < 100:
-        return None
-    points = point_map.points_map[index]
-    r = points[:, 2] - floor.z(points[:, 0], points[:, 1])
-    _, of_keyframe = np.unique(point_map.keyframe_id[index], return_inverse=True)
-    n = np.bincount(of_keyframe)
-    seen = n >= 20
-    if seen.sum() < LEAST_KEYFRAMES:
-        return None
-    means = np.bincount(of_keyframe, r)[seen] / n[seen]
-    return disagreement(means, float(np.mean(np.var(r) / n[seen])))
-
-
-def _position_sigma(point_map: PointMap, footprint: Footprint, grid: Grid, pile_m2: Array) -> float:
-    """What is left of the poses' error in plan over a lap. A shift of the whole map changes no volume: what counts is how
-    far the keyframes disagree on the walls, and in round halls the turns that walls do not show."""
-    told = point_map.position_sigma_m / math.sqrt(DRIFTS)
-    if not np.isfinite(footprint.lap_sigma_m):
-        return told
-    unseen = untold_turn(footprint.polygon_m)
-    if unseen > 0.0 and len(point_map.path_map):
-        x, y = grid.centres()
-        middle = footprint.polygon_m.mean(axis=0)
-        flown = float(np.mean(np.sum((point_map.path_map[:, :2] - middle) ** 2, axis=1)))
-        away = float(np.sum(pile_m2 * ((x - middle[0]) ** 2 + (y - middle[1]) ** 2))) / max(float(pile_m2.sum()), 1e-9)
-        unseen *= math.sqrt(min(away / max(flown, 1e-9), 1.0))  # a turn about the middle moves less what is near it
-    return math.hypot(footprint.lap_sigma_m, unseen * told)
 
 
 def _nothing(cfg: VolumeConfig, why: str) -> VolumeReport:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,23 +98,23 @@ def level_floor(grid: Grid, z_m: float) -> Floor:
     )
 
 
-def floor_beside(grid: Grid, floor: Floor, height: Array, pile: Mask) -> tuple[Array, Array]:
+def floor_beside(
+    grid: Grid, floor: Floor, height: Array, pile: Mask, halves: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
     """How far the floor under each pile lies above the plane, as the floor around it tells, and its 1 sigma.
 
     Floors undulate, and a map whose attitude drifted is bent: what lies about a pile was seen by the same scans as the
     pile, so its departure is the pile's own. The sigma is NaN where too little floor lies around: the plane has to do.
 
-    Args: height: (ny, nx) of the surface above the plane. pile: (ny, nx), with its rim of floor.
+    Args: height: (ny, nx) of the surface above the plane. pile: (ny, nx), with its rim of floor. halves: (ny, nx) each,
+        how far above the surface half of the flight saw it: then the sigma holds only what both halves show, the
+        ground's own waves and the map's; without, what its returns and poses err by too.
     Returns: (ny, nx) each, in m; zero and NaN outside the piles.
     """
-    label, n = ndimage.label(pile)
-    near = ndimage.binary_dilation(pile, disc(cells_of(FROM_M, grid)))
     rise, sigma = np.zeros(grid.shape), np.full(grid.shape, np.nan)
     row_at, column_at = np.indices(grid.shape).astype(np.float64)
     block = squares(grid, BLOCK_M)
-    for k in range(1, n + 1):
-        own = label == k
-        ring = ndimage.binary_dilation(own, disc(cells_of(TO_M, grid))) & ~near & floor.cells
+    for own, ring in floor_around(grid, floor, pile):
         _, of_block = np.unique(block[ring], return_inverse=True)
         count = np.bincount(of_block)
         full = count >= LEAST_IN_BLOCK
@@ -127,8 +128,41 @@ def floor_beside(grid: Grid, floor: Floor, height: Array, pile: Mask) -> tuple[A
         # As far as it stands out from what a ring tells by chance.
         trust = floor.undulation_m**2 / max(floor.undulation_m**2 + error2, 1e-12)
         rise[own] = trust * float(np.mean(height[ring]))
-        sigma[own] = np.sqrt(error2)
+        shared2 = None if halves is None else _shared2(grid, halves, height, ring)
+        sigma[own] = np.sqrt(error2 if shared2 is None else shared2 / full.sum())
     return rise, sigma
+
+
+def waves_m(grid: Grid, floor: Floor, height: Array, halves: tuple[Array, Array] | None) -> float:
+    """1 sigma of the bare floor about its plane over blocks of BLOCK_M: with halves only of what both of them show."""
+    shared2 = None if halves is None else _shared2(grid, halves, height, floor.cells)
+    return floor.undulation_m if shared2 is None else float(np.sqrt(shared2))
+
+
+def _shared2(grid: Grid, halves: tuple[Array, Array], height: Array, where: Mask) -> float | None:
+    """Covariance, over blocks, of the heights that two halves of a flight saw, each about its own plane; at least 0.
+    None: too few blocks that both saw."""
+    both = where & np.isfinite(halves[0]) & np.isfinite(halves[1])
+    _, of_block = np.unique(squares(grid, BLOCK_M)[both], return_inverse=True)
+    count = np.bincount(of_block)
+    full = count >= LEAST_IN_BLOCK
+    if full.sum() < LEAST_AROUND:
+        return None
+    row_at, column_at = np.indices(grid.shape).astype(np.float64)
+    values = (row_at, column_at, height + halves[0], height + halves[1])
+    *at, first, second = ((np.bincount(of_block, v[both]) / count)[full] for v in values)
+    design = np.column_stack([np.ones(len(first)), *at])
+    left = [means - design @ np.linalg.lstsq(design, means, rcond=None)[0] for means in (first, second)]
+    return max(float(left[0] @ left[1]) / (len(first) - 3), 0.0)
+
+
+def floor_around(grid: Grid, floor: Floor, pile: Mask) -> Iterator[tuple[Mask, Mask]]:
+    """Of each pile its cells, and those of the bare floor around it."""
+    label, n = ndimage.label(pile)
+    near = ndimage.binary_dilation(pile, disc(cells_of(FROM_M, grid)))
+    for k in range(1, n + 1):
+        own = np.asarray(label == k)
+        yield own, np.asarray(ndimage.binary_dilation(own, disc(cells_of(TO_M, grid))) & ~near & floor.cells)
 
 
 def _lowest_plane(design: Array, z: Array, tolerance: float) -> Array:

@@ -18,6 +18,7 @@ from companion.volume.contact import Contact
 from companion.volume.floor import BLOCK_M, Floor
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc, squares
 from companion.volume.keyframes import DRIFTS
+from companion.volume.poses import PoseErrors
 from companion.volume.surface import Cells, CellState, Surface
 
 LEAST_FLOOR_CELLS = 50
@@ -30,7 +31,7 @@ BESIDE_FLOOR = 0.2  # of an error in height is left where the same scans see the
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """All that the error budget looks at."""
+    """All that the error budget looks at. position_sigma_m, height_sigma_m: as told by the odometry."""
 
     grid: Grid
     cells: Cells
@@ -39,33 +40,31 @@ class Evidence:
     contact: Contact
     floor: Floor
     rise_sigma_m: Array
+    waves_m: float
     height_m: Array
     share: Array
     pile: Mask
     depth_m: Array
-    has_walls: bool
+    poses: PoseErrors
     range_offset_sigma_m: float
-    told_sigma_m: float
     position_sigma_m: float
     height_sigma_m: float
-    floor_disagreement_m: float
     wall_sigma_m: float
 
 
 def error_budget(e: Evidence) -> dict[str, float]:
     """1 sigma of each part, m3."""
     area = e.grid.cell_area_m2 * e.share * e.pile
-    pile_area = float(area.sum())
     flanks = _flanks(e, area)
-    flank = math.sqrt(sum(f * f for f in flanks))
     gaps, hidden = _interpolation(e, area)
     return {
         "returns": _sampling(e, area),
-        "position": flank * e.position_sigma_m,
-        "height": e.height_sigma_m * pile_area * BESIDE_FLOOR,
+        "poses": _told_poses(e, float(area.sum())) if e.poses.spread_m3 is None else e.poses.spread_m3,
+        "turns": e.poses.turns_m3,
         "range": e.range_offset_sigma_m * abs(_per_range(e, area, flanks)),
         "floor": math.hypot(_floor(e, area), _thin(e)),
-        "walls": math.hypot(e.wall_sigma_m, max(e.told_sigma_m, math.sqrt(DRIFTS) * e.position_sigma_m)) * _face(e),
+        # Who maps the wall is not who maps what lies on it: a slow drift between them shows in no stretch.
+        "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * e.poses.face_m2,
         "contact": _contact_height(e, area),
         "interpolated": gaps,
         "unseen": math.hypot(hidden, _shadows(e)),
@@ -82,6 +81,16 @@ def interval(volume_m3: float, budget: dict[str, float], level: float) -> tuple[
 def _sampling(e: Evidence, area: Array) -> float:
     sigma = np.nan_to_num(e.cells.sigma_m)
     return math.sqrt(float(np.sum((area * sigma) ** 2)))
+
+
+def _told_poses(e: Evidence, pile_m2: float) -> float:
+    """What the odometry's own word for its errors makes of them over a lap."""
+    return math.hypot(flank_m2(e) * e.position_sigma_m, pile_m2 * e.height_sigma_m * BESIDE_FLOOR) / math.sqrt(DRIFTS)
+
+
+def flank_m2(e: Evidence) -> float:
+    """The volume that a metre of error in plan moves, of another way on each side of the pile."""
+    return math.sqrt(sum(f * f for f in _flanks(e, e.grid.cell_area_m2 * e.share * e.pile)))
 
 
 def _flanks(e: Evidence, area: Array) -> tuple[float, float, float, float]:
@@ -116,7 +125,7 @@ def _floor(e: Evidence, area: Array) -> float:
     x, y = e.grid.centres()
     design = np.array([far.sum(), np.sum(far * (x - e.floor.centre_m[0])), np.sum(far * (y - e.floor.centre_m[1]))])
     plane = float(design @ e.floor.covariance @ design)
-    hidden = e.floor.undulation_m**2 * float(area.sum()) * BLOCK_M**2
+    hidden = e.waves_m**2 * float(area.sum()) * BLOCK_M**2
     return math.sqrt(near**2 + max(plane, 0.0) + hidden)
 
 
@@ -127,14 +136,6 @@ def _thin(e: Evidence) -> float:
     foot = begin & ~inner & (e.depth_m > RIM_M) & (e.share > 0)
     thin_m = max(THIN_M, BELL * float(np.mean(e.height_m[foot]))) if foot.any() else THIN_M
     return thin_m * THIN_REACH_M * float(edge.sum()) * e.grid.cell_m
-
-
-def _face(e: Evidence) -> float:
-    """Face of the pile against the walls, m2: what a metre of error in a wall's place would add."""
-    if not e.has_walls:
-        return 0.0
-    band = (np.abs(e.depth_m) < e.grid.cell_m) & (e.share > 0)
-    return float(np.sum(np.maximum(e.height_m, 0.0)[band & e.pile])) * e.grid.cell_m / 2.0
 
 
 def _contact_height(e: Evidence, area: Array) -> float:

@@ -13,7 +13,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from companion.messages import Array, PointMap
-from companion.volume.edges import fit_edges, pose_disagreement
+from companion.volume.edges import EdgeFit, fit_edges, pose_disagreement
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc
 from companion.volume.polygon import contains, coverage, edge_distance, outline, resample
 
@@ -32,8 +32,8 @@ class Footprint:
     polygon_m: (V, 2) counter-clockwise, in map. has_walls: False where the map's own extent had to do.
     share: (ny, nx) part of each cell inside the walls and outside obstacles. depth_m: (ny, nx) distance to the
     nearest wall, negative outside. blocked: cells whose returns belong to obstacles. noise_m: 1 sigma of wall returns
-    about the fitted walls. fit_sigma_m: of the walls' own place. pose_sigma_m, lap_sigma_m: how far single keyframes
-    disagree on it, and what that leaves of a lap; NaN where it cannot be told.
+    about the fitted walls. fit_sigma_m: of the walls' own place. pose_sigma_m: how far single keyframes disagree on it;
+    NaN where it cannot be told. fits: the stretches of wall; fit_keyframe: (F,) of the points that they were fitted to.
     beyond_ratio: share of all returns that lie beyond the walls, farther than noise throws them.
     """
 
@@ -45,7 +45,8 @@ class Footprint:
     noise_m: float
     fit_sigma_m: float
     pose_sigma_m: float
-    lap_sigma_m: float
+    fits: tuple[EdgeFit, ...]
+    fit_keyframe: Index
     ceiling_m: float
     beyond_ratio: float
     warnings: tuple[str, ...]
@@ -177,7 +178,8 @@ def _open_footprint(grid: Grid, key: Index, ceiling: float) -> Footprint:
         noise_m=0.0,
         fit_sigma_m=0.0,
         pose_sigma_m=float("nan"),
-        lap_sigma_m=float("nan"),
+        fits=(),
+        fit_keyframe=np.zeros(0, dtype=np.int64),
         ceiling_m=ceiling,
         beyond_ratio=0.0,
         warnings=(),
@@ -194,7 +196,7 @@ def _closed_footprint(
     fine, spread = _pull_to_wall(rough, points)
     polygon, fits = fit_edges(fine, points, spread)
     noise = float(np.median([f.noise_m for f in fits])) if fits else spread
-    pose_sigma, lap_sigma = pose_disagreement(fits, point_map.keyframe_id[wall])
+    keyframe = point_map.keyframe_id[wall]
     cx, cy = grid.centres()
     inside = contains(polygon, cx, cy)
     depth = np.where(inside, 1.0, -1.0) * edge_distance(polygon, cx, cy)
@@ -206,8 +208,9 @@ def _closed_footprint(
         blocked=np.zeros(grid.shape, dtype=np.bool_),
         noise_m=noise,
         fit_sigma_m=float(np.median([f.waviness_m for f in fits])) if fits else grid.cell_m,
-        pose_sigma_m=pose_sigma,
-        lap_sigma_m=lap_sigma,
+        pose_sigma_m=pose_disagreement(fits, keyframe),
+        fits=tuple(fits),
+        fit_keyframe=keyframe,
         ceiling_m=ceiling,
         beyond_ratio=0.0,
         warnings=(),

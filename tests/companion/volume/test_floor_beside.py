@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from companion.messages import Array
-from companion.volume.floor import Floor, floor_beside
+from companion.volume.floor import Floor, floor_beside, waves_m
 from companion.volume.grid import Grid, Mask
-from companion.volume.keyframes import DRIFTS, disagreement, untold_turn
+from companion.volume.keyframes import disagreement, drift_factor, untold_turn
 from tests.companion.volume.synthetic import circle, l_shape, rectangle
 
 
@@ -70,17 +70,70 @@ def test_each_pile_has_a_floor_of_its_own_and_one_between_walls_has_the_planes()
     assert np.isfinite(sigma[pile]).all()
 
 
-def test_errors_of_each_keyframe_average_out_and_drift_does_not() -> None:
-    rng = np.random.default_rng(7)
-    count = 400
-    each = rng.normal(0, 0.02, count)
-    drift = 0.02 * math.sqrt(2) * np.sin(np.linspace(0, 2 * np.pi, count))
-    single, lap = disagreement(each, 0.0)
-    assert single == pytest.approx(0.02, rel=0.15)
-    assert lap < 0.3 * single
-    single, lap = disagreement(drift, 0.0)
-    assert lap == pytest.approx(single / math.sqrt(DRIFTS), rel=0.01)
-    assert disagreement(each, 0.02**2 * 1.5) == (0.0, 0.0), "no more than noise explains"
+def halves_of(height: Array, noise_m: float) -> tuple[Array, Array]:
+    """Two halves of a flight that saw the same ground, each with errors of its own, about the mean of both."""
+    error = np.random.default_rng(8).normal(0, noise_m, (2, *height.shape))
+    return error[0] - error.mean(axis=0), error[1] - error.mean(axis=0)
+
+
+def test_only_what_both_halves_of_a_flight_show_is_the_grounds() -> None:
+    grid = grid_of(40.0, 30.0)
+    x, y = grid.centres()
+    pile = np.hypot(x - 20, y - 15) < 4.0
+    patches = np.random.default_rng(9).normal(0, 0.02, (2, 10, 14))  # of 3 m, as the floor's blocks
+    own, ground = (np.kron(p, np.ones((12, 12)))[: grid.ny, : grid.nx] for p in patches)
+    floor = flat(~pile, 0.02)
+    for height, halves, wanted in (
+        (ground, halves_of(ground, 0.01), 0.02),
+        (0.5 * own, (0.5 * own, -0.5 * own), 0.0),  # one half errs by `own`, the mean of both by half of it
+    ):
+        assert waves_m(grid, floor, height, halves) == pytest.approx(wanted, rel=0.25, abs=0.003)
+        _, alone = floor_beside(grid, floor, height, pile)
+        _, sigma = floor_beside(grid, floor, height, pile, halves)
+        assert float(alone[pile].max()) > 0.001
+        assert float(sigma[pile].max()) == pytest.approx(
+            float(alone[pile].max()) if wanted else 0.0, rel=0.25, abs=5e-4
+        )
+    assert waves_m(grid, floor, ground, None) == floor.undulation_m
+    nowhere = np.full(grid.shape, np.nan)
+    assert waves_m(grid, floor, ground, (nowhere, nowhere)) == floor.undulation_m, "halves that never met"
+
+
+def test_what_noise_explains_is_no_disagreement() -> None:
+    each = np.random.default_rng(7).normal(0, 0.02, 400)
+    assert disagreement(each, 0.0) == pytest.approx(0.02, rel=0.15)
+    assert disagreement(each, 0.02**2 * 1.5) == 0.0
+
+
+def wandering(rate: float, noise: float, seed: int, length: int = 60) -> list[Array]:
+    """What 60 keyframes err by on four walls and the floor: each error is `rate` of the one before and something new."""
+    rng = np.random.default_rng(seed)
+    series = rng.normal(0, 1.0, (5, length))
+    for k in range(1, length):
+        series[:, k] = rate * series[:, k - 1] + math.sqrt(1 - rate**2) * series[:, k]
+    return list(series + rng.normal(0, noise, series.shape))
+
+
+def test_a_drift_that_goes_on_from_stretch_to_stretch_is_told_by_the_keyframes() -> None:
+    def mean_factor(rate: float, noise: float) -> float:
+        return float(np.mean([drift_factor(wandering(rate, noise, seed), 8) for seed in range(20)]))
+
+    assert mean_factor(0.0, 0.0) < 1.03
+    assert mean_factor(0.9, 3.0) < mean_factor(0.9, 0.0), "noise is no drift"
+    # True: 1.78. Of a single lap no more can be read: its own mean hides some of it.
+    assert 1.25 < mean_factor(0.9, 0.0) < 1.8
+    assert mean_factor(0.5, 0.0) < mean_factor(0.8, 0.0) < mean_factor(0.9, 0.0)
+
+
+def test_where_little_was_seen_no_drift_is_told() -> None:
+    assert drift_factor([], 8) == 1.0
+    assert drift_factor([np.full(60, np.nan)], 8) == 1.0
+    assert drift_factor([np.zeros(60)], 8) == 1.0
+    assert drift_factor([np.arange(20.0)], 8) == 1.0, "shorter than the stretches are to be told"
+    some = wandering(0.9, 0.0, 3)
+    for series in some:
+        series[np.random.default_rng(4).random(60) < 0.3] = np.nan  # walls are not seen from everywhere
+    assert 1.0 < drift_factor(some, 8) < 2.0
 
 
 def test_only_round_walls_hide_a_turn() -> None:
