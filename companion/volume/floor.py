@@ -112,24 +112,18 @@ def floor_beside(
     Returns: (ny, nx) each, in m; zero and NaN outside the piles.
     """
     rise, sigma = np.zeros(grid.shape), np.full(grid.shape, np.nan)
-    row_at, column_at = np.indices(grid.shape).astype(np.float64)
-    block = squares(grid, BLOCK_M)
     for own, ring in floor_around(grid, floor, pile):
-        _, of_block = np.unique(block[ring], return_inverse=True)
-        count = np.bincount(of_block)
-        full = count >= LEAST_IN_BLOCK
-        if full.sum() < LEAST_AROUND:
-            continue
-        means, *at = ((np.bincount(of_block, v[ring]) / count)[full] for v in (height, row_at, column_at))
         # Where it leans, the middle is still its mean: what counts is how far it departs from a plane.
-        design = np.column_stack([np.ones(len(means)), *at])
-        left = means - design @ np.linalg.lstsq(design, means, rcond=None)[0]
-        error2 = float(np.sum(left**2)) / (len(means) - 3) / len(means)
+        left = _about_planes(grid, ring, height)
+        if left is None:
+            continue
+        blocks = len(left[0])
+        error2 = float(np.sum(left[0] ** 2)) / (blocks - 3) / blocks
         # As far as it stands out from what a ring tells by chance.
         trust = floor.undulation_m**2 / max(floor.undulation_m**2 + error2, 1e-12)
         rise[own] = trust * float(np.mean(height[ring]))
         shared2 = None if halves is None else _shared2(grid, halves, height, ring)
-        sigma[own] = np.sqrt(error2 if shared2 is None else shared2 / full.sum())
+        sigma[own] = np.sqrt(error2 if shared2 is None else shared2 / blocks)
     return rise, sigma
 
 
@@ -143,17 +137,22 @@ def _shared2(grid: Grid, halves: tuple[Array, Array], height: Array, where: Mask
     """Covariance, over blocks, of the heights that two halves of a flight saw, each about its own plane; at least 0.
     None: too few blocks that both saw."""
     both = where & np.isfinite(halves[0]) & np.isfinite(halves[1])
-    _, of_block = np.unique(squares(grid, BLOCK_M)[both], return_inverse=True)
+    left = _about_planes(grid, both, height + halves[0], height + halves[1])
+    return None if left is None else max(float(left[0] @ left[1]) / (len(left[0]) - 3), 0.0)
+
+
+def _about_planes(grid: Grid, where: Mask, *heights: Array) -> list[Array] | None:
+    """Of each (ny, nx) of heights its means over blocks of BLOCK_M within `where`, about their own plane. None: too few."""
+    _, of_block = np.unique(squares(grid, BLOCK_M)[where], return_inverse=True)
     count = np.bincount(of_block)
     full = count >= LEAST_IN_BLOCK
     if full.sum() < LEAST_AROUND:
         return None
-    row_at, column_at = np.indices(grid.shape).astype(np.float64)
-    values = (row_at, column_at, height + halves[0], height + halves[1])
-    *at, first, second = ((np.bincount(of_block, v[both]) / count)[full] for v in values)
-    design = np.column_stack([np.ones(len(first)), *at])
-    left = [means - design @ np.linalg.lstsq(design, means, rcond=None)[0] for means in (first, second)]
-    return max(float(left[0] @ left[1]) / (len(first) - 3), 0.0)
+    row_at, column_at, *means = (
+        (np.bincount(of_block, v[where]) / count)[full] for v in (*np.indices(grid.shape).astype(np.float64), *heights)
+    )
+    design = np.column_stack([np.ones(len(row_at)), row_at, column_at])
+    return [m - design @ np.linalg.lstsq(design, m, rcond=None)[0] for m in means]
 
 
 def floor_around(grid: Grid, floor: Floor, pile: Mask) -> Iterator[tuple[Mask, Mask]]:

@@ -2,8 +2,8 @@
 
 The keyframes are cut into stretches one after the other. Without each of them in turn the piles, the floor about them
 and the walls would lie a little elsewhere; by how much the volume then differs tells what the errors of the poses and
-of the returns leave in it. Nothing has to be known of how they hang together: what drifts slowly makes stretches
-differ, what moves pile, floor and walls alike moves nothing.
+of the returns leave in it. What moves pile, floor and walls alike moves nothing. What drifts on from one stretch into the
+next makes neighbours agree, and is told too small: `keyframes.drift_factor` says by how much.
 """
 
 from __future__ import annotations
@@ -85,11 +85,14 @@ def cut_in_stretches(
     known = (cell >= 0) & np.isfinite(above)
     order = np.searchsorted(flown, point_map.keyframe_id[known])
     wall_order = np.searchsorted(flown, wall_keyframe)
-    begins = [start * len(flown) // (STARTS * STRETCHES) for start in range(STARTS)]
-    of_point, of_wall = (
-        np.array([(n + begin) * STRETCHES // len(flown) % STRETCHES for begin in begins]) for n in (order, wall_order)
-    )
+    of_point, of_wall = (stretch_of(n, len(flown)) for n in (order, wall_order))
     return Stretches(shape=grid.shape, cell=cell[known], above_m=above[known], of_point=of_point, of_wall=of_wall)
+
+
+def stretch_of(order: Index, flown: int) -> Index:
+    """(STARTS, N) stretch of each keyframe, for each way to cut a flight of so many. order: (N,) from 0."""
+    begins = [start * flown // (STARTS * STRETCHES) for start in range(STARTS)]
+    return np.array([(order + begin) * STRETCHES // flown % STRETCHES for begin in begins])
 
 
 def _mean(count: Array, total: Array) -> Array:

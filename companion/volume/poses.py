@@ -11,7 +11,7 @@ import numpy as np
 from companion.messages import Array, PointMap
 from companion.volume.edges import EdgeFit
 from companion.volume.floor import Floor
-from companion.volume.grid import Grid, Mask
+from companion.volume.grid import Grid, Index, Mask
 from companion.volume.jackknife import STRETCHES, Stretches
 from companion.volume.keyframes import DRIFTS, LEAST_KEYFRAMES, by_keyframe, disagreement, drift_factor, untold_turn
 from companion.volume.surface import Cells, Surface
@@ -38,7 +38,7 @@ def pose_errors(
 ) -> PoseErrors:  # fmt: skip
     """pile_m2: (ny, nx) of the material's cells. piles: of each its cells and those of the floor that tells its height."""
     flown = np.unique(point_map.keyframe_id)
-    of_floor, floor_noise = floor_by_keyframe(point_map, cells, floor)
+    of_floor, floor_noise = floor_by_keyframe(point_map, cells, floor, flown)
     seen_floor = of_floor[np.isfinite(of_floor)]
     faces = _faces(footprint, grid, pile_m2 > 0.0, height_m)
     spread = None
@@ -55,9 +55,9 @@ def pose_errors(
     )
 
 
-def floor_by_keyframe(point_map: PointMap, cells: Cells, floor: Floor) -> tuple[Array, float]:
-    """How high above the plane each keyframe saw the floor, (K,), NaN where it saw too little; 1 sigma of that by noise."""
-    flown = np.unique(point_map.keyframe_id)
+def floor_by_keyframe(point_map: PointMap, cells: Cells, floor: Floor, flown: Index) -> tuple[Array, float]:
+    """How high above the plane each keyframe in `flown` (sorted) saw the floor, (K,), NaN where it saw too little; 1 sigma
+    of that by noise."""
     on_floor = cells.of_point >= 0
     on_floor[on_floor] = floor.cells.ravel()[cells.of_point[on_floor]]
     index = np.flatnonzero(on_floor)

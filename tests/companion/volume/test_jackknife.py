@@ -12,7 +12,7 @@ from companion.messages import Array
 from companion.volume import estimate_volume
 from companion.volume.edges import EdgeFit
 from companion.volume.grid import Mask
-from companion.volume.jackknife import LEAST_KEYFRAMES, STARTS, STRETCHES, Stretches
+from companion.volume.jackknife import LEAST_KEYFRAMES, STRETCHES, Stretches, stretch_of
 from tests.companion.volume.synthetic import Flight, Hall, circle, cone, make_map, rectangle, ridge
 
 SHAPE = (20, 30)
@@ -23,11 +23,6 @@ PILE_M2 = float(AREA[PILE].sum())
 KEYFRAMES = 96
 
 
-def stretch_of(keyframe: Array) -> Array:
-    begins = [start * KEYFRAMES // (STARTS * STRETCHES) for start in range(STARTS)]
-    return np.array([(keyframe + begin) * STRETCHES // KEYFRAMES % STRETCHES for begin in begins])
-
-
 def stretches(above_m: Array, seen: Mask | None = None) -> Stretches:
     """above_m, seen: (KEYFRAMES, ny, nx), one return of each keyframe in each cell."""
     keep = np.ones(above_m.shape, dtype=np.bool_) if seen is None else seen
@@ -36,8 +31,8 @@ def stretches(above_m: Array, seen: Mask | None = None) -> Stretches:
         shape=SHAPE,
         cell=np.ravel_multi_index(tuple(at), SHAPE),
         above_m=above_m[keep],
-        of_point=stretch_of(keyframe),
-        of_wall=stretch_of(np.arange(KEYFRAMES)),
+        of_point=stretch_of(keyframe, KEYFRAMES),
+        of_wall=stretch_of(np.arange(KEYFRAMES), KEYFRAMES),
     )
 
 
@@ -89,7 +84,7 @@ def test_a_wall_that_stretches_place_elsewhere_counts_with_the_face_on_it() -> N
 
 def test_halves_are_told_about_the_mean_of_both() -> None:
     above = np.zeros((KEYFRAMES, *SHAPE))
-    above[stretch_of(np.arange(KEYFRAMES))[0] % 2 == 0] = 0.04
+    above[stretch_of(np.arange(KEYFRAMES), KEYFRAMES)[0] % 2 == 0] = 0.04
     even, odd = stretches(above).halves_m()
     assert even == pytest.approx(np.full(SHAPE, 0.02))
     assert odd == pytest.approx(np.full(SHAPE, -0.02))
