@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -41,6 +42,7 @@ from companion.messages import (
 from companion.navigator import Navigator, NavigatorInput, NavigatorOutput
 from companion.navigator.guard import Guard, GuardInput
 from companion.odometry import Odometry, ScanResult
+from companion.odometry.turned import NOT_KNOWN, TurnedBy
 
 Tap = Callable[[topics.Topic, int, object], None]
 Source = tuple[str, int] | None
@@ -94,6 +96,8 @@ class Flight:
     scans: int = field(init=False, default=0)
     odometry_max_gap_s: float = field(init=False, default=0.0)
     _commands: list[OperatorCommand] = field(init=False, default_factory=list)
+    lidar_turned_by: TurnedBy = field(init=False, default=NOT_KNOWN)
+    _has_told_turned: bool = field(init=False, default=False)
     _mapped_ns: int | None = field(init=False, default=None)
     _judged: OdometryEstimate | None = field(init=False, default=None)
     _below_m: float | None = field(init=False, default=None)
@@ -161,6 +165,7 @@ class Flight:
             return False
         estimate = result.estimate
         self._note_quality(estimate)
+        self._note_turned(result.lidar_turned_by, estimate.t_scan_ns)
         self.estimate = estimate
         self.walls = result.wall_ranges
         self.session.send_wall_ranges(result.wall_ranges)
@@ -230,7 +235,10 @@ class Flight:
         cut_short = self.navigation is not None and not self.navigation.lap_closed
         if point_map is None:
             point_map = self.mapper.point_map()
-        return estimate_volume(point_map, self.config.volume, is_cut_short=cut_short)
+        report = estimate_volume(point_map, self.config.volume, is_cut_short=cut_short)
+        if self.lidar_turned_by.is_sure:
+            report = dataclasses.replace(report, warnings=(*report.warnings, self.lidar_turned_by.in_words()))
+        return report
 
     # ---- within -----------------------------------------------------------------------------------------------------
 
@@ -311,6 +319,14 @@ class Flight:
             )
             name = "degenerate" if weak else "no_longer_degenerate"
             self.tell(Event(t_ns=t_ns, severity=Severity.WARNING if weak else Severity.INFO, name=name, text=text))
+
+    def _note_turned(self, turned_by: TurnedBy, t_ns: int) -> None:
+        """Tell, once, that the LiDAR does not sit as its mount says."""
+        self.lidar_turned_by = turned_by
+        if turned_by.is_sure and not self._has_told_turned:
+            self._has_told_turned = True
+            text = f"LiDAR is turned by {math.degrees(turned_by.angle_rad):+.1f} deg about the vertical"
+            self.tell(Event(t_ns=t_ns, severity=Severity.WARNING, name="lidar_turned", text=text))
 
     def belongs_in_map(self, estimate: OdometryEstimate) -> bool:
         """Whether the scan of an estimate goes into the map; asked once of each, in order."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from companion.errors import FileFormatError
 from companion.messages import OdometryEstimate, VolumeReport
+from companion.odometry.turned import TurnedBy
 from companion.recording.log import MCAP_NAME
 from companion.recording.manifest import MANIFEST_NAME
 from companion.recording.tum import tum_line
@@ -83,6 +84,14 @@ def volume_keys(volume: VolumeReport | None) -> dict[str, Any]:
         "pile_area_m2": volume.pile_area_m2 if volume else None,
         "error_budget_m3": dict(volume.error_budget_m3) if volume else {},
         "warnings": list(volume.warnings) if volume else ["nothing was mapped"],
+    }
+
+
+def turned_keys(turned_by: TurnedBy) -> dict[str, float]:
+    """The report's keys that say how far the LiDAR is turned beyond its mount, by the flight, and 1 sigma of it."""
+    return {
+        "lidar_turned_deg": math.degrees(turned_by.angle_rad),
+        "lidar_turned_sigma_deg": math.degrees(turned_by.sigma_rad),
     }
 
 

@@ -27,7 +27,7 @@ from companion.recording.manifest import write_manifest
 from companion.telemetry.mqtt import Telemetry
 from companion.topics import EVENT, VOLUME, Topic
 from companion.warm_up import warm_up
-from stockpilot.files import fresh_folder, volume_keys, write_json, write_trajectory
+from stockpilot.files import fresh_folder, turned_keys, volume_keys, write_json, write_trajectory
 from stockpilot.mission import Mission, load_mission
 from stockpilot.recorded import listen, open_recorder
 from stockpilot.telemetry import DELIVERY_S, mqtt_task, mqtt_telemetry
@@ -107,6 +107,7 @@ def flight_report(mission: Mission, flight: Flight, app: App, wall_time_s: float
         "scans_dropped": app.scans_dropped,
         "keyframes": len(flight.keyframes),
         "lap_closed": bool(navigation is not None and navigation.lap_closed),
+        **turned_keys(flight.lidar_turned_by),
         "odometry_max_gap_s": flight.odometry_max_gap_s,
         "cadence": app.cadence.report(),
         "longest_lag_s": app.cadence.longest_lag_s,

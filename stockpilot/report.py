@@ -199,6 +199,8 @@ def _flight_rows(report: Mapping[str, Any]) -> list[Row]:
             ("keyframes", "keyframes", 0, "", 1.0),
             ("scan period", "scan_period_s", 1, "s", 1.0),
             ("longest gap in odometry", "odometry_max_gap_s", 3, "s", 1.0),
+            ("LiDAR turned about the vertical beyond its mount", "lidar_turned_deg", 1, "deg", 1.0),
+            ("1σ of that", "lidar_turned_sigma_deg", 1, "deg", 1.0),
             ("points in the cloud", "points", 0, "", 1.0),
         ],
     )

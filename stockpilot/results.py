@@ -17,7 +17,7 @@ from companion.odometry.paper import PaperPipeline
 from companion.volume import estimate_volume
 from companion.volume.paper import paper_volume
 from simbridge.world import World
-from stockpilot.files import volume_keys
+from stockpilot.files import turned_keys, volume_keys
 from stockpilot.lockstep import Outcome
 from stockpilot.mission import Mission
 from stockpilot.score import MapPin, PoseScore, cramer_rao_bound_m, pin_map, score_poses, wall_distance_rms_m
@@ -78,6 +78,7 @@ def score_flight(
         ),
         "landed_from_start_m": _landed_from_start(outcome),
         **volume_scores(volume, truth_volume),
+        **turned_keys(flight.lidar_turned_by),
         "odometry_max_gap_s": outcome.odometry_max_gap_s,
         "e_p_m": ours.e_p_m,
         "e_p_xy_m": ours.e_p_xy_m,

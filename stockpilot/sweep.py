@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from companion.config import Section
 from companion.errors import ConfigError
 from companion.mapping.export import load_point_map, save_point_map
+from companion.odometry.turned import TurnedBy
 from stockpilot.files import write_json
 from stockpilot.mission import load_mission
 
@@ -140,6 +142,11 @@ def measure_run(run: SweepRun, *, result: dict[str, Any], map_file: Path) -> dic
     volume = estimate_volume(
         load_point_map(map_file), mission.companion.volume, is_cut_short=not report.get("lap_closed")
     )
+    turned_by = TurnedBy(
+        *(math.radians(report.get(key, math.inf)) for key in ("lidar_turned_deg", "lidar_turned_sigma_deg"))
+    )
+    if turned_by.is_sure:
+        volume = replace(volume, warnings=(*volume.warnings, turned_by.in_words()))
     return {**result, "report": {**report, **volume_scores(volume, report["truth_volume_m3"])}}
 
 

@@ -13,6 +13,7 @@ from companion.odometry import filter as kalman
 from companion.odometry.attitude import AttitudeHistory
 from companion.odometry.height_map import BEND_SIGMA_RAD, HeightFit, HeightMap
 from companion.odometry.tilt import Tilt
+from companion.odometry.turned import TurnedBy
 from companion.odometry.wall_map import WallMap
 
 BLOCK_SIGMA_RATIO = 0.5  # means of blocks of about four returns
@@ -46,11 +47,12 @@ class HeightResult:
 class HeightTracker:
     """Fits each scan's lower layers to the ground map; near the start the rangefinder helps."""
 
-    def __init__(self, sensor_up_m: float) -> None:
+    def __init__(self, sensor_up_m: float, scan_s: float) -> None:
         self.ground = HeightMap()
         self.is_standing = True
         self.map_variance = 0.0
         self._sensor_up_m = sensor_up_m
+        self._middle_ns = round(0.5e9 * scan_s)  # of a scan, before its end
         self._rangefinder: deque[RangefinderSample] = deque(maxlen=64)
         self._rest_m, self._rests = 0.0, 0  # mean reading while standing, and of how many
         self._floor_m: float | None = None  # by the LiDAR, once it has left the ground
@@ -62,6 +64,10 @@ class HeightTracker:
     @property
     def tilt_offset_rad(self) -> tuple[float, float]:
         return float(self._tilt.offset[0]), float(self._tilt.offset[1])
+
+    @property
+    def lidar_turned_by(self) -> TurnedBy:
+        return self._tilt.turned.by
 
     def drift_variance(self) -> float:
         """Of z where the body is, m2, by the tilt that the ground's map was built with on the way there."""
@@ -168,7 +174,8 @@ class HeightTracker:
                 self._rejected = 0
             else:
                 self._rejected += 1
-        self._tilt.take(fit)
+        roll, pitch = history.at(np.array([vertical.t_ns - self._middle_ns], np.int64))[0, :2]
+        self._tilt.take(fit, float(roll), float(pitch))
         ground = fit.new_ground
         result = HeightResult(fit.correction[:3], sigma_z, ground, fit.ground_points, fit.wall_points)
         return vertical, result

@@ -37,6 +37,7 @@ from companion.odometry.placing import FAILED_AFTER, Placing
 from companion.odometry.ranges import SCANS, layer_ranges, wall_ranges
 from companion.odometry.specks import specks, without_dust
 from companion.odometry.standstill import Standstill
+from companion.odometry.turned import NOT_KNOWN, TurnedBy
 from companion.odometry.wall_map import Registration, WallMap
 
 KEYFRAME_HEIGHT_M = 0.5  # a climb of this much makes a keyframe too
@@ -64,6 +65,7 @@ class ScanResult:
     is_standing: bool
     is_yaw_weak: bool
     tilt_offset_rad: tuple[float, float]
+    lidar_turned_by: TurnedBy = NOT_KNOWN
 
 
 class Odometry:
@@ -78,7 +80,7 @@ class Odometry:
         self._snapshot: Snapshot | None = None
         self._published: Snapshot | None = None
         self._placing = Placing()
-        self.height = HeightTracker(cfg.lidar.mount_position_m[2])
+        self.height = HeightTracker(cfg.lidar.mount_position_m[2], 1.0 / cfg.lidar.rate_hz)
         self._standstill = Standstill()
         self._is_released = False  # the filter, from standing at the origin
         self._standing_scans = 0
@@ -221,6 +223,7 @@ class Odometry:
             is_standing=self._standstill.is_standing,
             is_yaw_weak=judgement is not None and judgement.is_yaw_weak,
             tilt_offset_rad=self.height.tilt_offset_rad,
+            lidar_turned_by=self.height.lidar_turned_by,
         )
 
     # -- steps

@@ -8,6 +8,7 @@ import numpy as np
 
 from companion.messages import Array
 from companion.odometry.height_map import HeightFit
+from companion.odometry.turned import Turned
 
 WALK = 0.0015  # rad per sqrt(s): how fast the attitude's error wanders
 SIGMA_RAD = 0.01  # how large it is thought to be
@@ -31,6 +32,7 @@ class Tilt:
         self.offset = np.zeros(2)
         self.lean = np.zeros(2)
         self.p = np.diag([SIGMA_RAD**2, SIGMA_RAD**2, FLOOR_RAD**2, FLOOR_RAD**2])
+        self.turned = Turned()
         self._information: Array | None = None  # of p as it is now, once it was asked for
         self._place = np.zeros(3)
         self._way_m, self._way_variance = 0.0, 0.0  # over ground; sum of the tilt's variance over it
@@ -61,6 +63,7 @@ class Tilt:
         new = max(self._lean_variance() - before * same**2, 0.0)
         self.offset, self.lean = self.offset * kept, self.lean * same
         keep = np.array([kept, kept, same, same])
+        self.turned.carry(keep)
         self.p = self.p * np.outer(keep, keep) + np.diag([WALK**2 * dt_s, WALK**2 * dt_s, new, new])
         self._information = None
 
@@ -70,8 +73,9 @@ class Tilt:
         reach_m = math.hypot(self._place[0], self._place[1])
         return self._way_variance / max(self._way_m, 1.0) * reach_m * min(reach_m, ELSEWHERE_M)
 
-    def take(self, fit: HeightFit) -> None:
-        """What the walls of a scan told."""
+    def take(self, fit: HeightFit, roll_rad: float, pitch_rad: float) -> None:
+        """What the walls of a scan told, and the attitude at it."""
+        self.turned.take(roll_rad, pitch_rad, fit.correction[1:], fit.information[1:, 1:], self.information)
         self.offset = np.clip(self.offset + fit.correction[1:3], -MAX_RAD, MAX_RAD)
         self.lean = self.lean + fit.correction[3:]
         self.p = np.asarray(np.linalg.inv(self.information + fit.information[1:, 1:]), np.float64)
@@ -95,5 +99,6 @@ class Tilt:
             self.p[2:, 2:] += np.eye(2) * (now - before)
         else:
             less = math.sqrt(now / before)
+            self.turned.carry(np.array([1.0, 1.0, less, less]))
             self.lean = self.lean * less
             self.p *= np.outer([1.0, 1.0, less, less], [1.0, 1.0, less, less])

@@ -24,6 +24,7 @@ from companion.flight import Flight
 from companion.messages import LevelledScan, OdometryEstimate, WallRanges
 from companion.odometry import ScanResult
 from companion.odometry.estimate import Snapshot
+from companion.odometry.turned import TurnedBy
 from companion.recording.run_types import Input
 from companion.recording.scan_ring import Arrival, ScanRing
 from companion.recording.scans import Accepted, ScansHere
@@ -46,6 +47,7 @@ class Found(NamedTuple):
     is_standing: bool
     is_yaw_weak: bool
     tilt_offset_rad: tuple[float, float]
+    lidar_turned_by: TurnedBy
 
     def result(self) -> ScanResult:
         """With no registration, no judgement, and no points where they do not go into the map."""
@@ -59,6 +61,7 @@ class Found(NamedTuple):
             is_standing=self.is_standing,
             is_yaw_weak=self.is_yaw_weak,
             tilt_offset_rad=self.tilt_offset_rad,
+            lidar_turned_by=self.lidar_turned_by,
         )
 
 
@@ -229,6 +232,6 @@ def _accept(flight: Flight, result: ScanResult | None) -> Registered:
         belongs = flight.belongs_in_map(result.estimate)
         found = Found(
             result.estimate, result.levelled if belongs else None, result.wall_ranges,
-            result.is_standing, result.is_yaw_weak, result.tilt_offset_rad,
+            result.is_standing, result.is_yaw_weak, result.tilt_offset_rad, result.lidar_turned_by,
         )  # fmt: skip
     return Registered(found, flight.odometry.snapshot, flight.odometry.t_attitude_ns)

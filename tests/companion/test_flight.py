@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -11,7 +13,9 @@ from companion.config import CompanionConfig
 from companion.flight import Flight
 from companion.mavlink import wire
 from companion.mavlink.computer import ComputerStatus
-from companion.messages import Event, OdometryEstimate
+from companion.messages import Event, LidarScan, OdometryEstimate
+from companion.odometry import ScanResult
+from companion.odometry.turned import TurnedBy
 from companion.recording.replay import Replay
 from companion.topics import EVENT, Topic
 from tests.companion.recording.corner import recorded
@@ -78,3 +82,30 @@ def test_a_place_found_anew_in_a_blind_landing_is_not_told_to_the_flight_control
     assert usual > 300
     assert odometry_sent(lands_blind=True, jumps=False) == usual
     assert 100 < odometry_sent(lands_blind=True, jumps=True) < usual - 100
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "sigma_deg", "is_told"), [(2.0, 0.4, True), (2.0, 0.8, False), (0.9, 0.2, False)]
+)
+def test_a_lidar_that_sits_turned_is_told_once_and_beside_the_volume(
+    angle_deg: float, sigma_deg: float, is_told: bool
+) -> None:
+    flight, inputs = recorded()
+    begin = flight.odometry.begin
+    turned_by = TurnedBy(math.radians(angle_deg), math.radians(sigma_deg))
+
+    def begun(scan: LidarScan) -> Callable[[], ScanResult | None]:
+        process = begin(scan)
+
+        def processed() -> ScanResult | None:
+            result = process()
+            return None if result is None else replace(result, lidar_turned_by=turned_by)
+
+        return processed
+
+    flight.odometry.begin = begun  # type: ignore[method-assign]
+    Replay(flight).run(inputs)
+    assert [e.text for e in flight.events if e.name == "lidar_turned"] == [
+        "LiDAR is turned by +2.0 deg about the vertical"
+    ] * is_told
+    assert any("correct the yaw of lidar.mount_rpy_deg by +2.0" in w for w in flight.measure().warnings) is is_told

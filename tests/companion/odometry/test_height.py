@@ -69,7 +69,7 @@ def test_no_plane_is_told_where_ground_was_seen_on_one_side_only() -> None:
 
 def test_a_rangefinder_cut_off_at_its_least_range_does_not_move_the_floor() -> None:
     rng = np.random.default_rng(3)
-    tracker = HeightTracker(SENSOR_UP_M)
+    tracker = HeightTracker(SENSOR_UP_M, 0.1)
     for n in range(400):
         reading = 0.12 + rng.normal(0.0, 0.03)
         if reading >= 0.10:  # what is nearer is not sent
@@ -84,7 +84,7 @@ def test_a_rangefinder_cut_off_at_its_least_range_does_not_move_the_floor() -> N
 
 def test_a_pile_beside_the_start_leaves_the_floor_to_the_rangefinder() -> None:
     rng = np.random.default_rng(4)
-    tracker = HeightTracker(SENSOR_UP_M)
+    tracker = HeightTracker(SENSOR_UP_M, 0.1)
     for n in range(50):
         tracker.on_rangefinder(RangefinderSample(t_ns=n * 100_000_000, distance_m=0.12))
         points = ring(rng)

@@ -56,24 +56,29 @@ class Room:
         points = np.column_stack([flat * c, flat * s, z, np.full(len(flat), 4.0)])
         return points[z + z_m > 0.0]
 
-    def hover(self, scans: int) -> Tilt:
-        """What is believed of the tilt, which is 0, after so many scans of 16 rows from one place."""
+    def hover(self, scans: int, *, turned_rad: float = 0.0, swing_rad: float = 0.0) -> Tilt:
+        """What is believed of the tilt's error, which is 0, after so many scans of 16 rows from one place.
+
+        turned_rad: of the LiDAR about the body's z beyond its mount. swing_rad: how far the vehicle tilts, about both axes.
+        """
         rng, tilt = np.random.default_rng(1), Tilt()
         bearing, elevation = (
             a.ravel()
             for a in np.meshgrid((np.arange(128) + 0.5) * 2 * math.pi / 128, np.radians(-3.0 * np.arange(1, 16)))
         )
-        for _ in range(scans):
+        for n in range(scans):
             tilt.carry(0.1, np.array([*PLACE, UP_M]))
             points = self.seen(bearing, elevation, UP_M, rng)
-            points[:, :3] = points[:, :3] @ _turned(tilt.offset).T
+            roll, pitch = swing_rad * math.sin(0.9 * n), swing_rad * math.sin(0.5 * n)
+            missed = turned_rad * np.array([pitch, -roll])
+            points[:, :3] = points[:, :3] @ _turned(tilt.offset - missed).T
             fit = self.ground.fit(
                 points, np.array([*PLACE, 0.0]), UP_M, self.walls, sigma_range_m=NOISE_M / 2, gate_m=0.6,
                 seen_spread_m=UP_M, lean=tilt.lean, tilt_information=np.linalg.inv(tilt.p),
                 shift_information=np.eye(2) / 0.01**2,
             )  # fmt: skip
             assert fit.wall_points > 200
-            tilt.take(fit)
+            tilt.take(fit, roll, pitch)
         return tilt
 
 
@@ -99,6 +104,23 @@ def test_bumpy_walls_leave_the_tilt_as_unsure_as_it_is_however_long_it_hovers() 
     errors = np.array([tilt.offset / sigma_rad(tilt) for tilt in tilts])
     assert np.mean(errors**2) < 5.0  # 1 if exact; 19 were bumps no more than noise
     assert np.degrees(np.median([sigma_rad(tilt) for tilt in tilts])) > 0.1
+
+
+@pytest.mark.parametrize("turned_deg", [-2.0, 0.0, 3.0])
+def test_a_lidar_turned_about_the_vertical_shows_where_the_vehicle_tilts(turned_deg: float) -> None:
+    tilt = Room(0.0, 1).hover(150, turned_rad=math.radians(turned_deg), swing_rad=math.radians(2.0))
+    found = tilt.turned.by
+    assert found.sigma_rad < math.radians(0.4)
+    assert abs(found.angle_rad - math.radians(turned_deg)) < 3.0 * found.sigma_rad
+    assert found.is_sure == (turned_deg != 0.0)
+    assert f"lidar.mount_rpy_deg by {math.degrees(found.angle_rad):+.1f}" in found.in_words()
+
+
+def test_nothing_is_known_of_it_where_the_vehicle_stays_level_or_no_wall_is_seen() -> None:
+    still = Room(0.0, 1).hover(60, turned_rad=math.radians(3.0)).turned.by
+    assert still.sigma_rad > math.radians(9.9)
+    assert not still.is_sure
+    assert not Tilt().turned.by.is_sure
 
 
 def test_off_the_start_height_is_as_unsure_as_the_tilt_that_the_ground_was_mapped_with() -> None:
