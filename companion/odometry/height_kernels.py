@@ -36,6 +36,8 @@ WALL_SPREAD_M = 1.0  # of heights at which a wall must have been seen to count a
 MIN_SHIFT_POINTS = 50
 LEAST_SLOPE = 0.25  # along the axis: the floor's noise looks like less, and would tell of places that nobody knows
 LOOSE_RAD = 0.02  # holds a tilt that hardly any wall tells
+BLOCK_RAD = math.radians(2.9)  # neighbours of a layer that are averaged into one point: 4 of 512 columns
+LEAST_COS2 = 0.05  # of the angle at which a beam meets a wall
 BESIDE_M = 1.2  # where the ground at a wall's foot is not known, it is looked for this far before the wall
 
 
@@ -210,8 +212,12 @@ def _wall_rows(
         ax, ay = c * wall[2] + s * wall[3], -s * wall[2] + c * wall[3]
         jac[k, 0], jac[k, 1], jac[k, 4], jac[k, 5] = -ay * pz, ax * pz, wall[2], wall[3]
         jac[k, 2], jac[k, 3] = -wall[3] * pz, wall[2] * pz
+        far2 = px * px + py * py
+        head_on = ax * px + ay * py
+        along = head_on / max(math.sqrt(far2 + pz * pz), 1e-6)
+        wide2 = (far2 * BLOCK_RAD) ** 2 / max(head_on * head_on, LEAST_COS2 * far2, 1e-6)
         res[k] = wall[2] * (x - wall[4]) + wall[3] * (y - wall[5]) + jac[k, 2] * lean[0] + jac[k, 3] * lean[1]
-        along = (ax * px + ay * py) / max(math.sqrt(px * px + py * py + pz * pz), 1e-6)
+        res[k] -= wall[7] * wide2 / 24.0  # the mean of a block of a bent wall lies within the bend
         var[k] = (sigma_range_m * along) ** 2 + SURFACE_SIGMA_M**2 + CORRELATED * wall[6]
         sector[k] = math.floor((math.atan2(py, px) / (2.0 * math.pi) + 0.5) * SECTORS) % SECTORS
         k += 1

@@ -21,9 +21,9 @@ WINDOW = 2
 W, X, Y, XX, XY, YY, VX, VY, VYAW = range(9)
 SUMS = 9
 # a line: normal (2), point on it (2), variance across, weight, variance along, pose variance x, y, yaw, lowest and highest
-# z it was seen at, spread of z over which the same cells were seen
-NX, NY, CX, CY, ACROSS, WEIGHT, ALONG, PX, PY, PYAW, LOW, HIGH, SPREAD = range(13)
-LINE = 13
+# z it was seen at, spread of z over which the same cells were seen, curvature (1/m, positive: bent toward the normal)
+NX, NY, CX, CY, ACROSS, WEIGHT, ALONG, PX, PY, PYAW, LOW, HIGH, SPREAD, CURVE = range(14)
+LINE = 14
 DIRTY, VALID, NO_LINE = 0, 1, 2
 
 MIN_WEIGHT = 5.0
@@ -32,6 +32,8 @@ ANGULAR_SIGMA_RAD = 0.0015  # of a beam's direction: time stamps, attitude, the 
 NORMAL_SIGMA_RAD = 0.02  # what the normal of a window errs by however many points it holds: curves, steps
 NEIGHBOURS = 4  # on each side of a point
 CORRELATED = 8.0  # points of one scan that share a line, and so its error
+CURVE_SIGMA = 0.05  # 1/m: of curvatures where nothing is known of them
+MOST_CURVE = 0.15  # 1/m: what bends more is a corner, or a column
 BENT = 0.05  # variance across over along, beyond the noise, above which a window holds no straight wall (a column: 0.1)
 # A surface seen from one height only may lean: material lies at 35 deg and its outline shrinks as the vehicle climbs.
 LEVEL_M = 0.05  # change of height that matters to none
@@ -114,7 +116,48 @@ def fit_line(sums: Array, spread: Array, state: NDArray[np.uint8], lines: Array,
     line[ACROSS], line[WEIGHT], line[ALONG] = across, w, along
     line[PX], line[PY], line[PYAW] = total[VX] / w, total[VY] / w, total[VYAW] / w
     line[LOW], line[HIGH], line[SPREAD] = low / w, high / w, (high - low) / w
+    line[CURVE] = _curvature(sums, line, iy, ix)
     state[iy, ix] = VALID
+
+
+@kernel
+def _curvature(sums: Array, line: Array, iy: int, ix: int) -> float:
+    """Of what stands in the window, by the means of the bands of cells that lie one after the other along its line.
+
+    A line through the points of a round wall of 16 m radius lies 6 mm inside of it at the window's middle, on all sides of
+    the vehicle: no shift takes that up, and it passes for tilt.
+    """
+    ny, nx = sums.shape[:2]
+    is_along_x = abs(line[NY]) >= abs(line[NX])
+    system, right = np.zeros((3, 3)), np.zeros(3)
+    for b in range(-WINDOW, WINDOW + 1):
+        w, x, y = 0.0, 0.0, 0.0
+        for k in range(-WINDOW, WINDOW + 1):
+            jy, jx = (iy + k, ix + b) if is_along_x else (iy + b, ix + k)
+            if 0 <= jy < ny and 0 <= jx < nx:
+                w += sums[jy, jx, W]
+                x += sums[jy, jx, X]
+                y += sums[jy, jx, Y]
+        if w <= 0.0:
+            continue
+        dx, dy = x / w - line[CX], y / w - line[CY]
+        a, off = -line[NY] * dx + line[NX] * dy, line[NX] * dx + line[NY] * dy
+        shape = (1.0, a, 0.5 * a * a)
+        for i in range(3):
+            right[i] += w * shape[i] * off
+            for j in range(3):
+                system[i, j] += w * shape[i] * shape[j]
+    noise = CORRELATED * max(line[ACROSS], 1e-6)
+    system[2, 2] += noise / CURVE_SIGMA**2
+    system[1, 1] += 1e-9 * line[WEIGHT]
+    curve = solve3(system, right)[2]
+    return float(curve) if abs(curve) < MOST_CURVE else 0.0
+
+
+@kernel
+def bend_m(line: Array, off: float) -> float:
+    """How far what a line stands for lies toward its normal, off along it from its point: the line is the mean of it."""
+    return 0.5 * float(line[CURVE]) * (off * off - float(line[ALONG]))
 
 
 @kernel
@@ -204,7 +247,7 @@ def residuals(
             + CORRELATED * max(line[ACROSS] - sigma_range_m**2 - line[PX] - line[PY] - BENT * line[ALONG], 0.0)
         )
         rows[n, 0] = i
-        rows[n, 1] = line[NX] * dx + line[NY] * dy
+        rows[n, 1] = line[NX] * dx + line[NY] * dy - bend_m(line, off)
         rows[n, 2] = math.sqrt(variance)
         rows[n, 3] = -line[NX] * py + line[NY] * px
         rows[n, 4] = line[NX] * px + line[NY] * py
@@ -359,9 +402,10 @@ def lines_at(
     points: Array,
     pose: Array,
 ) -> Array:
-    """What stands at each of (N, 3) levelled points: (N, 8) how it is known, height spread, line, variance of the line.
+    """What stands at each of (N, 3) levelled points: (N, 8) how it is known, height spread, line, variance of the line, curvature.
 
-    How it is known: 0 nothing seen there, 1 something without a line, 2 a line: normal (2), point on it (2).
+    How it is known: 0 nothing seen there, 1 something without a line, 2 a line: normal (2), point on it (2), and curvature:
+    of a wall that is bent, its tangent there.
     """
     ny, nx = state.shape
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -377,8 +421,13 @@ def lines_at(
         if state[iy, ix] == VALID:
             line = lines[iy, ix]
             out[i, 0], out[i, 1] = 2.0, line[SPREAD]
-            out[i, 2], out[i, 3], out[i, 4], out[i, 5] = line[NX], line[NY], line[CX], line[CY]
-            out[i, 6] = line[ACROSS] / line[WEIGHT]
+            off = -line[NY] * (x - line[CX]) + line[NX] * (y - line[CY])
+            turn, bend = float(line[CURVE]) * off, bend_m(line, off)
+            norm = math.sqrt(1.0 + turn * turn)
+            out[i, 2], out[i, 3] = (line[NX] + turn * line[NY]) / norm, (line[NY] - turn * line[NX]) / norm
+            out[i, 4] = line[CX] - line[NY] * off + line[NX] * bend
+            out[i, 5] = line[CY] + line[NX] * off + line[NY] * bend
+            out[i, 6], out[i, 7] = line[ACROSS] / line[WEIGHT], line[CURVE]
         elif sums[iy, ix, W] > 0.0:
             out[i, 0], out[i, 1] = 1.0, spread[iy, ix, 1] - spread[iy, ix, 0]
     return out

@@ -13,6 +13,7 @@ from companion.geometry import matrix_from_quat, quat_from_rpy
 from companion.messages import Array, LevelledScan, LidarGeometry, LidarScan
 from companion.odometry import level_kernels as lk
 from companion.odometry.attitude import AttitudeHistory
+from companion.odometry.height_kernels import BLOCK_RAD
 
 LOW_M = 1.5  # of height: until it has risen, nothing tells walls from the foot of a pile
 LOW_SPACING_M = 0.2
@@ -22,7 +23,6 @@ BELOW_RAD = math.radians(
 )  # the layer that is asked whether a surface leans: reaches the floor at five times the height
 NOISE_RATE = 0.05  # of a scan in what is known of the noise of returns
 MIN_BENDS = 50  # of which the noise of returns is told
-BLOCK_RAD = math.radians(2.9)  # neighbours of a layer that are averaged: 4 of 512 columns
 
 
 class AllReturns(NamedTuple):
