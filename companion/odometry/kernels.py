@@ -32,7 +32,7 @@ ANGULAR_SIGMA_RAD = 0.0015  # of a beam's direction: time stamps, attitude, the 
 NORMAL_SIGMA_RAD = 0.02  # what the normal of a window errs by however many points it holds: curves, steps
 NEIGHBOURS = 4  # on each side of a point
 CORRELATED = 8.0  # points of one scan that share a line, and so its error
-CURVE_SIGMA = 0.05  # 1/m: of curvatures where nothing is known of them
+LEAST_BANDS = 4  # of a window's five, to tell whether it is bent
 MOST_CURVE = 0.15  # 1/m: what bends more is a corner, or a column
 BENT = 0.05  # variance across over along, beyond the noise, above which a window holds no straight wall (a column: 0.1)
 # A surface seen from one height only may lean: material lies at 35 deg and its outline shrinks as the vehicle climbs.
@@ -129,7 +129,7 @@ def _curvature(sums: Array, line: Array, iy: int, ix: int) -> float:
     """
     ny, nx = sums.shape[:2]
     is_along_x = abs(line[NY]) >= abs(line[NX])
-    system, right = np.zeros((3, 3)), np.zeros(3)
+    system, right, bands = np.zeros((3, 3)), np.zeros(3), 0
     for b in range(-WINDOW, WINDOW + 1):
         w, x, y = 0.0, 0.0, 0.0
         for k in range(-WINDOW, WINDOW + 1):
@@ -140,6 +140,7 @@ def _curvature(sums: Array, line: Array, iy: int, ix: int) -> float:
                 y += sums[jy, jx, Y]
         if w <= 0.0:
             continue
+        bands += 1
         dx, dy = x / w - line[CX], y / w - line[CY]
         a, off = -line[NY] * dx + line[NX] * dy, line[NX] * dx + line[NY] * dy
         shape = (1.0, a, 0.5 * a * a)
@@ -147,11 +148,13 @@ def _curvature(sums: Array, line: Array, iy: int, ix: int) -> float:
             right[i] += w * shape[i] * off
             for j in range(3):
                 system[i, j] += w * shape[i] * shape[j]
-    noise = CORRELATED * max(line[ACROSS], 1e-6)
-    system[2, 2] += noise / CURVE_SIGMA**2
-    system[1, 1] += 1e-9 * line[WEIGHT]
-    curve = solve3(system, right)[2]
-    return float(curve) if abs(curve) < MOST_CURVE else 0.0
+    if bands < LEAST_BANDS:
+        return 0.0
+    curve = float(solve3(system, right)[2])
+    variance = float(line[ACROSS] * solve3(system, np.array([0.0, 0.0, 1.0]))[2])
+    if abs(curve) > MOST_CURVE:
+        return 0.0
+    return curve**3 / max(curve**2 + variance, 1e-12)  # the less, the less of it is known: most walls are straight
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -16,7 +16,7 @@ from companion.volume.floor import Floor, fit_floor, floor_around, floor_beside,
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc, grid_around
 from companion.volume.interval import RIM_M, Evidence, error_budget, interval
 from companion.volume.jackknife import cut_in_stretches
-from companion.volume.objects import find_objects
+from companion.volume.objects import LARGEST_CELL_M, Objects, find_objects, on_grid, without_objects
 from companion.volume.poses import pose_errors
 from companion.volume.shadow import Shadow, lay_hidden
 from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells, without_strays
@@ -59,7 +59,35 @@ def estimate_volume(
         return _nothing(cfg, f"the map has only {len(points)} points: no surface can be told")
     point_map = _seen_from_above(point_map)
     points = point_map.points_map
-    grid = grid_around(points, cfg.cell_m)
+    relief = _relief(point_map, cfg.cell_m, floor_z_m)
+    if relief is None:
+        return _nothing(cfg, "the map shows no surface within the walls")
+    objects = _find_objects(relief, point_map, floor_z_m)
+    report = _report(point_map, cfg, relief, objects)
+    return _at_least(report) if is_cut_short and not relief.footprint.has_walls else report
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Relief:
+    """What the map shows on one grid."""
+
+    grid: Grid
+    footprint: Footprint
+    cells: Cells
+    floor: Floor
+    contact: Contact
+    shadow: Shadow
+
+    def height_m(self) -> Array:
+        """(ny, nx) of the surface above the floor, 0 where it is not known."""
+        floor_z = np.where(self.footprint.share > 0, self.floor.z(*self.grid.centres()), np.nan)
+        return np.asarray(np.nan_to_num(self.shadow.surface.z_m - floor_z))
+
+
+def _relief(point_map: PointMap, cell_m: float, floor_z_m: float | None) -> _Relief | None:
+    """None: no surface within the walls."""
+    points = point_map.points_map
+    grid = grid_around(points, cell_m)
     key = grid.key(points)
     footprint = find_footprint(point_map, grid, key)
     strip = (footprint.depth_m < footprint.margin_m + 0.5 * grid.cell_m) | footprint.blocked
@@ -71,7 +99,7 @@ def estimate_volume(
         cells = without_strays(cells, grid, footprint.depth_m < footprint.margin_m + BESIDE_WALLS_M)
     usable = cells.seen & (footprint.share > 0)
     if usable.sum() < 20:
-        return _nothing(cfg, "the map shows no surface within the walls")
+        return None
     if floor_z_m is None:
         floor = fit_floor(grid, cells.x, cells.y, cells.z, cells.sigma_m, usable)
     else:
@@ -88,8 +116,21 @@ def estimate_volume(
     )
     surface, contact = _meet_walls(points, grid, np.where(low, key, -1), footprint, floor, surface)
     shadow = lay_hidden(point_map, grid, surface, floor.z(*grid.centres()), footprint.noise_m)
-    report = _report(point_map, cfg, grid, footprint, cells, floor, shadow, contact)
-    return _at_least(report) if is_cut_short and not footprint.has_walls else report
+    return _Relief(grid=grid, footprint=footprint, cells=cells, floor=floor, contact=contact, shadow=shadow)
+
+
+def _find_objects(relief: _Relief, point_map: PointMap, floor_z_m: float | None) -> Objects:
+    """What stands upright in it, looked for in cells that are small enough to show it."""
+    fine = relief if relief.grid.cell_m <= LARGEST_CELL_M else _relief(point_map, LARGEST_CELL_M, floor_z_m)
+    if fine is None:
+        fine = relief
+    inside = fine.footprint.share > 0
+    trusted = (
+        inside & (fine.footprint.depth_m > fine.footprint.margin_m + 2 * fine.grid.cell_m) & ~fine.footprint.blocked
+    )
+    trusted &= ~ndimage.binary_dilation(fine.shadow.sigma_m > 0)
+    objects = find_objects(fine.grid, fine.height_m(), inside, trusted)
+    return objects if fine is relief else on_grid(objects, fine.grid, relief.grid)
 
 
 def _at_least(report: VolumeReport) -> VolumeReport:
@@ -110,29 +151,15 @@ def _meet_walls(
     return replace(surface, z_m=surface.z_m + contact.rise_m), contact
 
 
-def _report(
-    point_map: PointMap,
-    cfg: VolumeConfig,
-    grid: Grid,
-    footprint: Footprint,
-    cells: Cells,
-    floor: Floor,
-    shadow: Shadow,
-    contact: Contact,
-) -> VolumeReport:
-    surface = shadow.surface
-    x, y = grid.centres()
-    floor_z = np.where(footprint.share > 0, floor.z(x, y), np.nan)
-    height = np.nan_to_num(surface.z_m - floor_z)
-    inside = footprint.share > 0
-    trusted = inside & (footprint.depth_m > footprint.margin_m + 2 * grid.cell_m) & ~footprint.blocked
-    trusted &= ~ndimage.binary_dilation(shadow.sigma_m > 0)
-    objects = find_objects(grid, height, inside, trusted)
-    height = objects.height_m
+def _report(point_map: PointMap, cfg: VolumeConfig, relief: _Relief, objects: Objects) -> VolumeReport:
+    grid, cells, floor, shadow, surface = relief.grid, relief.cells, relief.floor, relief.shadow, relief.shadow.surface
+    inside = relief.footprint.share > 0
+    height = without_objects(grid, relief.height_m(), objects.covered, inside)
+    floor_z = np.where(inside, floor.z(*grid.centres()), np.nan)
     footprint = replace(
-        footprint,
-        share=np.where(objects.cells, 0.0, footprint.share),
-        warnings=(*footprint.warnings, *objects.warnings),
+        relief.footprint,
+        share=relief.footprint.share * (1.0 - objects.share),
+        warnings=(*relief.footprint.warnings, *objects.warnings),
     )
     pile = pile_mask(height, footprint.share > 0, cells, floor, grid)
     stretches = cut_in_stretches(point_map, grid, cells, surface, footprint.fit_keyframe)
@@ -149,7 +176,7 @@ def _report(
         cells=cells,
         surface=surface,
         hidden_sigma_m=shadow.sigma_m,
-        contact=contact,
+        contact=relief.contact,
         floor=floor,
         rise_sigma_m=rise_sigma,
         waves_m=waves,

@@ -3,12 +3,13 @@
 Loose material lies at its angle of repose, at most some 45 deg. A thing that is steep along nearly all of its outline
 was put there; a pile with one dug face is not. What stands in the foot of a pile, or beside it, shows such an outline
 only from some height on: so outlines are looked at level by level, from the floor up. Where too little of one is steep,
-nobody can tell from heights alone: it is counted, and said.
+nobody can tell from heights alone: it is counted, and said. They are looked for in cells of LARGEST_CELL_M at most: over two cells
+of 0.4 m a box of 1.2 m rises no steeper than loose material may.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -18,6 +19,7 @@ from companion.volume.grid import Grid, Mask, disc
 
 STEEP = 1.5  # rise over run across two cells, corners too: 45 deg gives 1.41 there
 FACE = 2.2  # the same within the material, where an uneven flank may be steep for a step
+LARGEST_CELL_M = 0.25
 LEAST_HEIGHT_M = 0.3
 LEVEL_M = 0.3  # from one outline to the next
 LEAST_ABOVE_M = 0.4  # what rises less above its outline is a clod
@@ -33,11 +35,11 @@ LEAST_STEEP_M2 = 1.0  # of steep cells within the pile before it is said
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Objects:
-    """cells: which objects stand in. height_m: without them, and without the rim that their returns blur, by what is around.
-    doubtful_m3: what is counted and may be objects."""
+    """share: of each cell, (ny, nx), that objects stand on. covered: the cells that they, and the rim that their returns blur,
+    lie in. doubtful_m3: what is counted and may be objects."""
 
-    cells: Mask
-    height_m: Array
+    share: Array
+    covered: Mask
     doubtful_m3: float
     warnings: tuple[str, ...]
 
@@ -75,15 +77,26 @@ def find_objects(grid: Grid, height: Array, inside: Mask, trusted: Mask) -> Obje
             f"upright faces over {area:.1f} m2 within the material: a dug face, or an object that touches it; it is counted"
         )
     return Objects(
-        cells=cells,
-        height_m=_levelled(grid, height, covered & inside, inside),
+        share=cells.astype(np.float64),
+        covered=covered,
         doubtful_m3=doubtful_m3,
         warnings=tuple(warnings),
     )
 
 
-def _levelled(grid: Grid, height: Array, covered: Mask, inside: Mask) -> Array:
+def on_grid(objects: Objects, of: Grid, grid: Grid) -> Objects:
+    """Objects that were found on a finer grid, on this one."""
+    x, y = of.centres()
+    key = grid.key(np.column_stack([x.ravel(), y.ravel()]))
+    fine = np.maximum(grid.count(key), 1.0)
+    share = np.bincount(key[key >= 0], objects.share.ravel()[key >= 0], minlength=fine.size).reshape(grid.shape) / fine
+    covered = grid.count(np.where(objects.covered.ravel(), key, -1)) > 0
+    return replace(objects, share=share, covered=covered)
+
+
+def without_objects(grid: Grid, height: Array, covered: Mask, inside: Mask) -> Array:
     """Heights with each covered patch laid on the plane of what is around it."""
+    covered = covered & inside
     out = height.copy()
     x, y = grid.centres()
     label, n = ndimage.label(covered)

@@ -312,6 +312,16 @@ def test_box_on_the_floor_is_not_material() -> None:
     assert any("upright sides" in w for w in report.warnings)
 
 
+@pytest.mark.parametrize("cell_m", [0.4, 0.5])
+def test_box_is_not_material_on_coarse_cells_either(cell_m: float) -> None:
+    """Over two of them a box of 1.2 m rises no steeper than loose material may."""
+    hall = Hall(footprint=rectangle(), pile=ridge(25, 15, 6, 6.0, 0.7), boxes=((42.0, 3.0, 44.0, 4.5, 1.2),))
+    synthetic = make_map(hall, QUICK, 9)
+    report = estimate_volume(synthetic.point_map, VolumeConfig(cell_m=cell_m))
+    assert any("upright sides" in w for w in report.warnings)
+    assert report.interval_m3[0] <= synthetic.true_volume_m3 <= report.interval_m3[1]
+
+
 def test_box_at_the_foot_of_a_pile_is_not_material() -> None:
     hall = Hall(footprint=rectangle(), pile=cone(25, 15, 4.0, 0.65), boxes=((30.0, 14.0, 32.0, 16.5, 2.2),))
     report, error = measured(make_map(hall, QUICK, 3))
