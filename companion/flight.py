@@ -42,6 +42,7 @@ from companion.messages import (
 from companion.navigator import Navigator, NavigatorInput, NavigatorOutput
 from companion.navigator.guard import Guard, GuardInput
 from companion.odometry import Odometry, ScanResult
+from companion.odometry.tilt import MOST_TILT_RAD
 from companion.odometry.turned import NOT_KNOWN, TurnedBy
 
 Tap = Callable[[topics.Topic, int, object], None]
@@ -98,6 +99,7 @@ class Flight:
     _commands: list[OperatorCommand] = field(init=False, default_factory=list)
     lidar_turned_by: TurnedBy = field(init=False, default=NOT_KNOWN)
     _has_told_turned: bool = field(init=False, default=False)
+    _leans: bool = field(init=False, default=False)  # by more than can be corrected, at some time
     _mapped_ns: int | None = field(init=False, default=None)
     _judged: OdometryEstimate | None = field(init=False, default=None)
     _below_m: float | None = field(init=False, default=None)
@@ -165,7 +167,7 @@ class Flight:
             return False
         estimate = result.estimate
         self._note_quality(estimate)
-        self._note_turned(result.lidar_turned_by, estimate.t_scan_ns)
+        self._note_mount(result)
         self.estimate = estimate
         self.walls = result.wall_ranges
         self.session.send_wall_ranges(result.wall_ranges)
@@ -236,9 +238,13 @@ class Flight:
         if point_map is None:
             point_map = self.mapper.point_map()
         report = estimate_volume(point_map, self.config.volume, is_cut_short=cut_short)
-        if self.lidar_turned_by.is_sure:
-            report = dataclasses.replace(report, warnings=(*report.warnings, self.lidar_turned_by.in_words()))
-        return report
+        said = [self.lidar_turned_by.in_words()] if self.lidar_turned_by.is_sure else []
+        if self._leans:
+            said.append(
+                f"the LiDAR leans against the flight controller's attitude by {math.degrees(MOST_TILT_RAD):g} deg or more, "
+                "which is more than is corrected: heights are wrong; check lidar.mount_rpy_deg and fly again"
+            )
+        return dataclasses.replace(report, warnings=(*report.warnings, *said)) if said else report
 
     # ---- within -----------------------------------------------------------------------------------------------------
 
@@ -320,9 +326,14 @@ class Flight:
             name = "degenerate" if weak else "no_longer_degenerate"
             self.tell(Event(t_ns=t_ns, severity=Severity.WARNING if weak else Severity.INFO, name=name, text=text))
 
-    def _note_turned(self, turned_by: TurnedBy, t_ns: int) -> None:
+    def _note_mount(self, result: ScanResult) -> None:
         """Tell, once, that the LiDAR does not sit as its mount says."""
+        turned_by, t_ns = result.lidar_turned_by, result.estimate.t_scan_ns
         self.lidar_turned_by = turned_by
+        if max(map(abs, result.tilt_offset_rad)) >= MOST_TILT_RAD and not self._leans:
+            self._leans = True
+            text = f"LiDAR leans {math.degrees(MOST_TILT_RAD):g} deg or more: check its mount"
+            self.tell(Event(t_ns=t_ns, severity=Severity.CRITICAL, name="lidar_leans", text=text))
         if turned_by.is_sure and not self._has_told_turned:
             self._has_told_turned = True
             text = f"LiDAR is turned by {math.degrees(turned_by.angle_rad):+.1f} deg about the vertical"

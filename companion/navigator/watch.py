@@ -90,7 +90,7 @@ class VisionWatch:
         if estimate.quality < 0:
             return "registration failed"
         largest, covariance = self._guard.max_position_sigma_m**2, estimate.pose_covariance
-        if not (0.0 <= covariance[0, 0] <= largest and 0.0 <= covariance[1, 1] <= largest):
+        if not all(0.0 <= covariance[axis, axis] <= largest for axis in range(3)):
             return UNCERTAIN
         return ""
 

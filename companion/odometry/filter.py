@@ -213,6 +213,16 @@ def update_vertical(state: Vertical, z_m: float, variance: float) -> Vertical:
     return Vertical(state.t_ns, np.array([z + gain_z * off, vz + gain_v * off]), p)
 
 
+def stopped_vertical(state: Vertical) -> Vertical:
+    """Nobody knows how it climbs: on average not at all."""
+    return Vertical(state.t_ns, np.array([float(state.x[0]), 0.0]), state.p)
+
+
+def found_vertical(state: Vertical, z_m: float, variance: float) -> Vertical:
+    """At another height than was thought, which says nothing of how fast it climbs."""
+    return Vertical(state.t_ns, np.array([z_m, 0.0]), np.diag([variance, 0.5**2]))
+
+
 def let_go(state: Planar, gyro_offset_radps: float, stood_s: float, turned_rad: float) -> Planar:
     """Standing has just ended: near the origin still, and slow; what the gyro read meanwhile is its offset. turned_rad: by
     the gyro, since it surely stood."""

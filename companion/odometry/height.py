@@ -28,6 +28,9 @@ MIN_GATE_M = 0.1
 MIN_GROUND_POINTS = 20
 SHIFT_SIGMA_M = 0.008  # of x and y beside their covariance: lines are a little off too
 MAX_REJECTED = 10
+OFF_REJECTED = 2  # in a row: what is accepted then is another height, not a climb
+OFF_SCANS = 5  # without a height: what was known of the climb is not carried on
+JUMP_M = 0.5  # a height that is found so far off is a restart
 CONTRADICTED_M = 0.5  # by which the rangefinder may differ from a height that was refused before (dust)
 FRESH_NS = 500_000_000  # age of a reading that still counts
 OVER_GROUND_SIGMA_M = 0.15  # of the height by rangefinder and ground map, off the start
@@ -58,7 +61,9 @@ class HeightTracker:
         self._floor_m: float | None = None  # by the LiDAR, once it has left the ground
         self._tilt = Tilt()
         self._highest_m = 0.0
+        self.has_jumped = False  # by the last scan
         self._rejected = 0
+        self._unmeasured = 0  # scans without a height
         self._t_ns = 0
 
     @property
@@ -158,6 +163,11 @@ class HeightTracker:
         dt_s = max(0.0, (vertical.t_ns - self._t_ns) * 1e-9) if self._t_ns else 0.0
         self._t_ns = vertical.t_ns
         self._tilt.carry(dt_s, np.append(planar.x[:2], vertical.x[0]))
+        self.has_jumped = False
+        is_off = self._rejected >= OFF_REJECTED or self._unmeasured >= OFF_SCANS
+        if self._unmeasured >= OFF_SCANS:  # it would fly away with the velocity that it had, and the vehicle after it
+            vertical = kalman.stopped_vertical(vertical)
+        self._unmeasured += 1
         fit = self.fit(lower, planar, vertical, walls, sigma_m)
         self._highest_m = max(self._highest_m, float(vertical.x[0]))
         sigma_z = math.inf
@@ -168,8 +178,14 @@ class HeightTracker:
             refit = float(vertical.x[0] + fit.correction[0])
             if by_range is not None and abs(refit - by_range) > CONTRADICTED_M:
                 vertical = kalman.update_vertical(vertical, by_range, OVER_GROUND_SIGMA_M**2)
+                self._unmeasured = 0
             elif abs(fit.correction[0]) < gate or self._rejected >= MAX_REJECTED:
-                vertical = kalman.update_vertical(vertical, refit, sigma_z**2)
+                if is_off and abs(fit.correction[0]) > MIN_GATE_M:
+                    self.has_jumped = abs(float(fit.correction[0])) > JUMP_M
+                    vertical = kalman.found_vertical(vertical, refit, sigma_z**2)
+                else:
+                    vertical = kalman.update_vertical(vertical, refit, sigma_z**2)
+                self._unmeasured = 0
                 self.map_variance = fit.map_variance
                 self._rejected = 0
             else:

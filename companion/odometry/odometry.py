@@ -204,6 +204,7 @@ class Odometry:
                 planar, vertical = self._stand(
                     history, planar, vertical, registration, judgement, fit.correction[0], fit.z_sigma_m
                 )
+            reset |= self._is_released and self.height.has_jumped
             snapshot = self._after(old, scan, planar, vertical, registration, judgement, reset)
         variance = np.array([planar.p[0, 0], planar.p[1, 1], planar.p[6, 6], vertical.p[0, 0]]) + snapshot.map_variance
         if judgement is None or (judgement.is_accepted and not self._placing.is_lost):

@@ -13,7 +13,7 @@ from companion.odometry.turned import Turned
 WALK = 0.0015  # rad per sqrt(s): how fast the attitude's error wanders
 SIGMA_RAD = 0.01  # how large it is thought to be
 FLOOR_RAD = 0.0002
-MAX_RAD = math.radians(4.0)
+MOST_TILT_RAD = math.radians(8.0)  # that is corrected
 ELSEWHERE_M = 10.0  # way after which other bumps are in sight
 SHARED_MEMORY = 0.98  # of what is known of the bumps, from scan to scan
 SHARED_POINTS = 500  # on walls, that have to speak of bumps before they are believed in
@@ -76,7 +76,7 @@ class Tilt:
     def take(self, fit: HeightFit, roll_rad: float, pitch_rad: float) -> None:
         """What the walls of a scan told, and the attitude at it."""
         self.turned.take(roll_rad, pitch_rad, fit.correction[1:], fit.information[1:, 1:], self.information)
-        self.offset = np.clip(self.offset + fit.correction[1:3], -MAX_RAD, MAX_RAD)
+        self.offset = np.clip(self.offset + fit.correction[1:3], -MOST_TILT_RAD, MOST_TILT_RAD)
         self.lean = self.lean + fit.correction[3:]
         self.p = np.asarray(np.linalg.inv(self.information + fit.information[1:, 1:]), np.float64)
         self._information = None

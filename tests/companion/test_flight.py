@@ -84,27 +84,41 @@ def test_a_place_found_anew_in_a_blind_landing_is_not_told_to_the_flight_control
     assert 100 < odometry_sent(lands_blind=True, jumps=True) < usual - 100
 
 
-@pytest.mark.parametrize(
-    ("angle_deg", "sigma_deg", "is_told"), [(2.0, 0.4, True), (2.0, 0.8, False), (0.9, 0.2, False)]
-)
-def test_a_lidar_that_sits_turned_is_told_once_and_beside_the_volume(
-    angle_deg: float, sigma_deg: float, is_told: bool
-) -> None:
+def flown_with(changes: dict[str, object]) -> Flight:
+    """A recorded flight, with these in each result of the odometry."""
     flight, inputs = recorded()
     begin = flight.odometry.begin
-    turned_by = TurnedBy(math.radians(angle_deg), math.radians(sigma_deg))
 
     def begun(scan: LidarScan) -> Callable[[], ScanResult | None]:
         process = begin(scan)
 
         def processed() -> ScanResult | None:
             result = process()
-            return None if result is None else replace(result, lidar_turned_by=turned_by)
+            return None if result is None else replace(result, **changes)  # type: ignore[arg-type]
 
         return processed
 
     flight.odometry.begin = begun  # type: ignore[method-assign]
     Replay(flight).run(inputs)
+    return flight
+
+
+@pytest.mark.parametrize(("pitch_deg", "is_told"), [(8.0, True), (5.0, False)])
+def test_a_lidar_that_leans_by_more_than_is_corrected_is_told_once_and_beside_the_volume(
+    pitch_deg: float, is_told: bool
+) -> None:
+    flight = flown_with({"tilt_offset_rad": (0.0, -math.radians(pitch_deg))})
+    assert [e.name for e in flight.events].count("lidar_leans") == is_told
+    assert any("check lidar.mount_rpy_deg and fly again" in w for w in flight.measure().warnings) is is_told
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "sigma_deg", "is_told"), [(2.0, 0.4, True), (2.0, 0.8, False), (0.9, 0.2, False)]
+)
+def test_a_lidar_that_sits_turned_is_told_once_and_beside_the_volume(
+    angle_deg: float, sigma_deg: float, is_told: bool
+) -> None:
+    flight = flown_with({"lidar_turned_by": TurnedBy(math.radians(angle_deg), math.radians(sigma_deg))})
     assert [e.text for e in flight.events if e.name == "lidar_turned"] == [
         "LiDAR is turned by +2.0 deg about the vertical"
     ] * is_told

@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from companion.messages import RangefinderSample
+from companion.messages import AttitudeSample, RangefinderSample
 from companion.odometry import filter as kalman
 from companion.odometry import weak
+from companion.odometry.attitude import AttitudeBuffer
 from companion.odometry.height import HeightTracker
 from companion.odometry.height_map import HeightMap
 from companion.odometry.level import range_noise_m
@@ -188,3 +189,64 @@ def test_a_heap_does_not_lie_lower_in_the_map_than_it_is() -> None:
         assert known is not None
         errors.append(known[0] - (3.5 - 0.7 * math.hypot(x, y)))
     assert np.mean(errors) == pytest.approx(0.0, abs=0.003)  # it was -0.022
+
+
+SCAN_NS = 100_000_000
+
+
+def flown(tracker: HeightTracker, state: kalman.Vertical, true_z_m: float, scans: int) -> list[kalman.Vertical]:
+    """The vertical state after each scan of a body that stays at true_z_m above a floor that the tracker knows; nan: it sees
+    none of it."""
+    rng, attitude = np.random.default_rng(7), AttitudeBuffer()
+    planar = kalman.Planar(0, np.array([5.0, *np.zeros(7)]), np.diag([1e-4] * 8))  # off the start: no rangefinder
+    out = []
+    for _ in range(scans):
+        t_ns = state.t_ns + SCAN_NS
+        attitude.add(
+            AttitudeSample(t_ns=t_ns, q_ref_body_wxyz=np.array([1.0, 0.0, 0.0, 0.0]), rate_body_radps=np.zeros(3))
+        )
+        xy = rng.uniform(-8.0, 8.0, (0 if math.isnan(true_z_m) else 400, 2))
+        z = 0.03 * rng.standard_normal(len(xy)) - true_z_m
+        assert attitude.history is not None
+        state, _ = tracker.update(
+            np.column_stack([xy, z, np.full(len(xy), 4.0)]), planar, kalman.carry_vertical(state, t_ns),
+            attitude.history, WallMap(), 0.12,
+        )  # fmt: skip
+        out.append(state)
+    return out
+
+
+def tracker_over_floor() -> HeightTracker:
+    rng, tracker = np.random.default_rng(8), HeightTracker(SENSOR_UP_M, 0.1)
+    xy = rng.uniform(-10.0, 20.0, (20_000, 2))
+    tracker.ground.insert(
+        np.column_stack([xy, np.full(len(xy), -8.0), np.full(len(xy), 4.0)]), np.array([0.0, 0.0, 8.0]), np.zeros(3),
+        0.12, 1e-6,
+    )  # fmt: skip
+    return tracker
+
+
+def test_a_height_that_is_found_far_off_is_no_climb() -> None:
+    """Read as one, it flew away at 1.8 m/s, out of reach of the ground's map, and the vehicle after it into the roof."""
+    tracker = tracker_over_floor()
+    states = flown(tracker, kalman.Vertical(SCAN_NS, np.array([9.0, -0.2]), np.diag([0.05**2, 0.2**2])), 8.0, 60)
+    assert all(-0.2 < float(s.x[0]) - 8.0 < 1.05 for s in states)
+    assert all(abs(float(s.x[0]) - 8.0) < 0.05 for s in states[-20:])
+
+
+def test_a_height_that_nothing_tells_stays_and_is_told_as_unknown() -> None:
+    tracker = tracker_over_floor()
+    start = kalman.Vertical(SCAN_NS, np.array([8.0, -1.8]), np.diag([0.01**2, 0.1**2]))
+    states = flown(tracker, start, math.nan, 50)
+    assert float(states[-1].x[0]) > 8.0 - 1.8 * 0.7
+    assert float(states[-1].p[0, 0]) > 1.0
+
+
+def test_a_jump_of_height_is_told_as_a_restart() -> None:
+    tracker = tracker_over_floor()
+    jumps = []
+    state = kalman.Vertical(SCAN_NS, np.array([9.0, 0.0]), np.diag([0.05**2, 0.2**2]))
+    for _ in range(40):
+        state = flown(tracker, state, 8.0, 1)[-1]
+        jumps.append(tracker.has_jumped)
+    assert sum(jumps) == 1
