@@ -191,7 +191,7 @@ class HeightTracker:
             else:
                 self._rejected += 1
         roll, pitch = history.at(np.array([vertical.t_ns - self._middle_ns], np.int64))[0, :2]
-        self._tilt.take(fit, float(roll), float(pitch))
+        self._tilt.take(fit, float(roll), float(pitch), float(vertical.x[1]))
         ground = fit.new_ground
         result = HeightResult(fit.correction[:3], sigma_z, ground, fit.ground_points, fit.wall_points)
         return vertical, result

@@ -73,9 +73,9 @@ class Tilt:
         reach_m = math.hypot(self._place[0], self._place[1])
         return self._way_variance / max(self._way_m, 1.0) * reach_m * min(reach_m, ELSEWHERE_M)
 
-    def take(self, fit: HeightFit, roll_rad: float, pitch_rad: float) -> None:
-        """What the walls of a scan told, and the attitude at it."""
-        self.turned.take(roll_rad, pitch_rad, fit.correction[1:], fit.information[1:, 1:], self.information)
+    def take(self, fit: HeightFit, roll_rad: float, pitch_rad: float, climb_mps: float = 0.0) -> None:
+        """What the walls of a scan told, the attitude at it, and how fast it climbed."""
+        self.turned.take(roll_rad, pitch_rad, climb_mps, fit.correction[1:], fit.information[1:, 1:], self.information)
         self.offset = np.clip(self.offset + fit.correction[1:3], -MOST_TILT_RAD, MOST_TILT_RAD)
         self.lean = self.lean + fit.correction[3:]
         self.p = np.asarray(np.linalg.inv(self.information + fit.information[1:, 1:]), np.float64)

@@ -16,11 +16,13 @@ import numpy as np
 from companion.messages import Array
 
 SIGMA_RAD = math.radians(10.0)  # of what is known before
-TOLD_RAD = math.radians(1.0)  # less is of no account
-TOLD_SIGMAS = 3.0
-KNOWN_RAD = math.radians(
-    0.5
-)  # 1 sigma: on its first metres a flight has seen too little, and errs by one and the same thing
+TOLD_RAD = math.radians(1.25)  # less is of no account
+TOLD_SIGMAS = 3.5
+BLOCK_SCANS = 200  # in a row, whose errors may be one and the same: the attitude lags where the vehicle speeds up
+LEAST_BLOCKS = 4  # that have to tell of it
+# Climbing faster, walls are seen at new heights and the attitude's error is still being found: it errs by degrees.
+CLIMB_MPS = 0.3
+KNOWN_RAD = math.radians(0.5)  # 1 sigma, above which nothing is told
 
 
 class TurnedBy(NamedTuple):
@@ -52,27 +54,40 @@ class Turned:
 
     def __init__(self) -> None:
         self._drawn = np.zeros(4)  # of roll, pitch and lean as estimated without it: for each radian of it
-        self._information, self._pull = SIGMA_RAD**-2, 0.0
+        self._blocks: list[list[float]] = []  # of scans: information, and pull
+        self._scans = 0
 
     @property
     def by(self) -> TurnedBy:
-        return TurnedBy(self._pull / self._information, self._information**-0.5)
+        """Its sigma is what the blocks disagree by, where that is more than they tell."""
+        information = SIGMA_RAD**-2 + sum(block[0] for block in self._blocks)
+        angle = sum(block[1] for block in self._blocks) / information
+        apart = [own * (pull / own - angle) ** 2 for own, pull in self._blocks if own > SIGMA_RAD**-2]
+        if len(apart) < LEAST_BLOCKS:
+            return TurnedBy(angle, SIGMA_RAD)
+        return TurnedBy(angle, math.sqrt(max(1.0, sum(apart) / (len(apart) - 1)) / information))
 
     def carry(self, keep: Array) -> None:
         """On to the next scan: keep (4,) of the tilt's estimate stays."""
         self._drawn = self._drawn * keep
 
-    def take(self, roll_rad: float, pitch_rad: float, correction: Array, information: Array, prior: Array) -> None:
+    def take(
+        self, roll_rad: float, pitch_rad: float, climb_mps: float, correction: Array, information: Array, prior: Array
+    ) -> None:
         """What the walls of a scan told.
 
         Args:
-            roll_rad, pitch_rad: the attitude at the scan.
+            roll_rad, pitch_rad: the attitude at the scan. climb_mps: how fast it climbs.
             correction: (4,) of roll, pitch, lean, as found with the prior. information: (4, 4) of the walls.
             prior: (4, 4) information before.
         """
         shown = self._drawn + np.array([pitch_rad, -roll_rad, 0.0, 0.0])
         told = information @ shown
         taken = np.linalg.solve(prior + information, told)
-        self._information += float(told @ (shown - taken))
-        self._pull += float(shown @ (prior @ correction))
+        if self._scans % BLOCK_SCANS == 0:
+            self._blocks.append([0.0, 0.0])
+        self._scans += 1
+        if abs(climb_mps) < CLIMB_MPS:
+            self._blocks[-1][0] += float(told @ (shown - taken))
+            self._blocks[-1][1] += float(shown @ (prior @ correction))
         self._drawn = self._drawn - taken

@@ -10,6 +10,7 @@ import pytest
 from companion.messages import Array
 from companion.odometry.height_map import HeightMap
 from companion.odometry.tilt import Tilt
+from companion.odometry.turned import BLOCK_SCANS, Turned, TurnedBy
 from companion.odometry.wall_map import WallMap
 
 HALF_M = 19.0
@@ -108,12 +109,36 @@ def test_bumpy_walls_leave_the_tilt_as_unsure_as_it_is_however_long_it_hovers() 
 
 @pytest.mark.parametrize("turned_deg", [-2.0, 0.0, 3.0])
 def test_a_lidar_turned_about_the_vertical_shows_where_the_vehicle_tilts(turned_deg: float) -> None:
-    tilt = Room(0.0, 1).hover(150, turned_rad=math.radians(turned_deg), swing_rad=math.radians(2.0))
+    tilt = Room(0.0, 1).hover(801, turned_rad=math.radians(turned_deg), swing_rad=math.radians(1.0))
     found = tilt.turned.by
     assert found.sigma_rad < math.radians(0.4)
     assert abs(found.angle_rad - math.radians(turned_deg)) < 3.0 * found.sigma_rad
     assert found.is_sure == (turned_deg != 0.0)
     assert f"lidar.mount_rpy_deg by {math.degrees(found.angle_rad):+.1f}" in found.in_words()
+
+
+def told_by_blocks(degrees: list[float]) -> TurnedBy:
+    """After blocks of scans each of which shows that much, to 1 deg."""
+    turned, tilt, unknown = Turned(), math.radians(2.0), np.diag([1e8, 1e8, 1e8, 1e8])
+    information = np.diag([1.0, 1.0, 0.0, 0.0]) / (math.radians(1.0) * tilt) ** 2 / BLOCK_SCANS
+    for shown in degrees:
+        for n in range(BLOCK_SCANS):
+            missed = math.radians(shown) * np.array([0.0, -tilt, 0.0, 0.0])
+            correction = np.linalg.solve(unknown + information, information @ missed)
+            turned.take(tilt, 0.0, 0.0, correction, information, unknown)
+            turned.carry(np.zeros(4))
+    return turned.by
+
+
+def test_what_one_manoeuvre_tells_is_not_believed_when_the_others_do_not() -> None:
+    alike, apart = told_by_blocks([3.0] * 16), told_by_blocks([0.0] * 13 + [16.0] * 3)
+    assert math.degrees(alike.angle_rad) == pytest.approx(3.0, abs=0.05)
+    assert math.degrees(apart.angle_rad) == pytest.approx(3.0, abs=0.05)
+    assert math.degrees(alike.sigma_rad) == pytest.approx(0.25, abs=0.01)
+    assert math.degrees(apart.sigma_rad) > 1.0
+    assert alike.is_sure
+    assert not apart.is_sure
+    assert not told_by_blocks([3.0] * 3).is_sure  # too short a flight
 
 
 def test_nothing_is_known_of_it_where_the_vehicle_stays_level_or_no_wall_is_seen() -> None:
