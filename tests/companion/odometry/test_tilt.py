@@ -122,7 +122,7 @@ def told_by_blocks(degrees: list[float]) -> TurnedBy:
     turned, tilt, unknown = Turned(), math.radians(2.0), np.diag([1e8, 1e8, 1e8, 1e8])
     information = np.diag([1.0, 1.0, 0.0, 0.0]) / (math.radians(1.0) * tilt) ** 2 / BLOCK_SCANS
     for shown in degrees:
-        for n in range(BLOCK_SCANS):
+        for _ in range(BLOCK_SCANS):
             missed = math.radians(shown) * np.array([0.0, -tilt, 0.0, 0.0])
             correction = np.linalg.solve(unknown + information, information @ missed)
             turned.take(tilt, 0.0, 0.0, correction, information, unknown)
