@@ -42,6 +42,7 @@ def stockpilot(*arguments: str) -> subprocess.Popen[str]:
 @pytest.mark.timeout(400)
 def test_two_programs_fly_and_sigterm_lands_with_everything_recorded(tmp_path: Path) -> None:
     with flying(tmp_path, "emulated") as programs:
+        assert programs.said.hears("Takeoff detected", UNTIL_CLIMB_S), programs.said.text()  # late on a busy machine
         time.sleep(3.0)
         programs.companion.send_signal(signal.SIGTERM)
         report = programs.companion_report()
