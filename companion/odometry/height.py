@@ -159,7 +159,9 @@ class HeightTracker:
         sigma_m: float,
     ) -> tuple[kalman.Vertical, HeightResult]:
         """Vertical state after this scan. lower: (N, 3) levelled points of the layers below the horizontal one."""
-        vertical = self._use_rangefinder(vertical, planar.x[kalman.POSE], history)
+        ranged = self._use_rangefinder(vertical, planar.x[kalman.POSE], history)
+        if ranged is not vertical:
+            vertical, self._unmeasured = ranged, 0
         dt_s = max(0.0, (vertical.t_ns - self._t_ns) * 1e-9) if self._t_ns else 0.0
         self._t_ns = vertical.t_ns
         self._tilt.carry(dt_s, np.append(planar.x[:2], vertical.x[0]))

@@ -250,3 +250,24 @@ def test_a_jump_of_height_is_told_as_a_restart() -> None:
         state = flown(tracker, state, 8.0, 1)[-1]
         jumps.append(tracker.has_jumped)
     assert sum(jumps) == 1
+
+
+def test_above_the_start_the_rangefinder_alone_tells_a_climb() -> None:
+    tracker, attitude = HeightTracker(SENSOR_UP_M, 0.1), AttitudeBuffer()
+    for n in range(10):
+        tracker.on_rangefinder(RangefinderSample(t_ns=n, distance_m=0.12))
+    tracker.is_standing = False
+    state = kalman.Vertical(SCAN_NS, np.array([0.0, 0.8]), np.diag([0.02**2, 0.2**2]))
+    planar = kalman.Planar(0, np.zeros(8), np.diag([1e-4] * 8))
+    for n in range(1, 31):
+        t_ns = SCAN_NS * (n + 1)
+        attitude.add(
+            AttitudeSample(t_ns=t_ns, q_ref_body_wxyz=np.array([1.0, 0.0, 0.0, 0.0]), rate_body_radps=np.zeros(3))
+        )
+        tracker.on_rangefinder(RangefinderSample(t_ns=t_ns, distance_m=0.12 + 0.08 * n))
+        assert attitude.history is not None
+        state, _ = tracker.update(
+            np.zeros((0, 4)), planar, kalman.carry_vertical(state, t_ns), attitude.history, WallMap(), 0.12
+        )
+    assert float(state.x[0]) == pytest.approx(2.4, abs=0.05)
+    assert float(state.x[1]) == pytest.approx(0.8, abs=0.15)
