@@ -44,7 +44,7 @@ def draw(number: int) -> dict[str, Any]:
 
 def _hides_a_box(sim: SimConfig) -> bool:
     """A pile that covers a box holds less than it shows, and nothing that flies can tell."""
-    world = build_world(sim.world)
+    world = build_world(sim.store)
     return any(world.surface_height(*box.center) > box.size_m[2] - LEAST_SEEN_M for box in sim.world.boxes)
 
 

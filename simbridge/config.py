@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationError, model_validator
 
 from simbridge import footprint as fp
 from simbridge.piles import Pile
 from simbridge.section import Finite, NonNegative, Point, Positive, Ratio, Section, Vector, refuse
 
+SEEDS_APART = 1000  # of the bumps of one mission's seed and the next
 MIN_THRUST_TO_WEIGHT = 1.3  # less does not climb and steer at once
 
 
@@ -113,12 +114,28 @@ class WorldConfig(Section):
     wall_roughness: Roughness = Roughness()
     piles: tuple[Pile, ...] = ()
     pile_cell_m: Positive = Field(0.2, ge=0.05, le=1.0, description="edge of the piles' triangles")
+    bumps_by_seed: bool = Field(
+        False, description="the mission's seed draws the bumps of piles and walls too: another store for each seed"
+    )
     wind: Wind = Wind()
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         fp.check_world(self)
         return self
+
+    def of_seed(self, seed: int) -> WorldConfig:
+        """The store that a mission of this seed flies in: itself, unless its bumps are drawn by the seed."""
+        if not self.bumps_by_seed:
+            return self
+        drawn, rough = (seed + 1) * SEEDS_APART, self.wall_roughness
+        return self.model_copy(
+            update={
+                "piles": tuple(pile.model_copy(update={"seed": pile.seed + drawn}) for pile in self.piles),
+                "wall_roughness": rough.model_copy(update={"seed": rough.seed + drawn}),
+                "bumps_by_seed": False,
+            }
+        )
 
 
 class StartCircle(Section):
@@ -283,6 +300,17 @@ class SimConfig(Section):
     seed: int = Field(0, ge=0)
 
     @model_validator(mode="after")
-    def _start_is_free(self) -> Self:
-        fp.check_start(self.world, self.vehicle.start)
+    def _fits_the_store(self) -> Self:
+        if self.world.bumps_by_seed:
+            try:
+                fp.check_world(self.store)
+            except ValidationError as error:
+                first = error.errors()[0]
+                refuse(("world", *first["loc"]), first["input"], f"{first['msg']} (bumps drawn by seed {self.seed})")
+        fp.check_start(self.store, self.vehicle.start)
         return self
+
+    @property
+    def store(self) -> WorldConfig:
+        """The world, with the bumps that this seed draws where it is asked to."""
+        return self.world.of_seed(self.seed)

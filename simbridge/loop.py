@@ -64,7 +64,7 @@ class Simulation:
         gets sensors and gives motor commands; 1 suits PX4, ArduCopter wants more than 720 a second."""
         kernels.warm_up()
         nearness.warm_up()
-        self.world: World = build_world(cfg.world, cfg.vehicle)
+        self.world: World = build_world(cfg.store, cfg.vehicle)
         self.start: tuple[float, float, float] = start_pose(cfg)
         self.t_ns = BOOT_NS
         self.collision = False
@@ -175,7 +175,7 @@ def start_pose(cfg: SimConfig) -> tuple[float, float, float]:
     if not isinstance(start, StartCircle):
         return start[0], start[1], math.radians(start[2]) if len(start) == 3 else 0.0
     rng = stream(cfg.seed, "start")
-    places = fp.start_places(cfg.world, start.circle.center, start.circle.radius_m, rng, 400)
+    places = fp.start_places(cfg.store, start.circle.center, start.circle.radius_m, rng, 400)
     if len(places) == 0:
         raise ValueError(f"vehicle.start.circle: no place to stand found in it with seed {cfg.seed}")
     yaw = rng.uniform(-math.pi, math.pi) if start.yaw_deg is None else math.radians(start.yaw_deg)

@@ -158,7 +158,7 @@ def _tops(companion: CompanionConfig, sim: SimConfig, teller: Teller) -> Iterato
     """What ends about the height of flight is not seen by the level scan that the vehicle avoids things by."""
     from simbridge import footprint as fp
 
-    world, height = sim.world, companion.navigator.height_m
+    world, height = sim.store, companion.navigator.height_m
     low, high = fp.start_floor_z(world, sim.vehicle.start)
     tops = [(f"world.piles.{i}", fp.pile_top_z(world, pile)) for i, pile in enumerate(world.piles)]
     tops += [(f"world.{o.name}", o.top_z) for o in fp.obstacles(world)]

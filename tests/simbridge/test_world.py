@@ -221,3 +221,34 @@ def test_start_in_a_circle_differs_by_seed_and_stays_in_it() -> None:
     assert start_pose(sim_config(vehicle={"start": start}, seed=7)) == poses[7]
     fixed = start_pose(sim_config(vehicle={"start": {**start, "yaw_deg": 90}}, seed=7))
     assert fixed[2] == pytest.approx(math.pi / 2)
+
+
+def test_bumps_by_seed_draw_another_store_for_each_seed() -> None:
+    rough = {"piles": [{**CONE, "unevenness_m": 0.2}], "wall_roughness": {"rms_m": 0.1}}
+
+    def of_seed(seed: int, **world: Any) -> World:
+        return build_world(sim_config(world={**rough, **world}, seed=seed).store)
+
+    def walls(seed: int) -> Any:
+        return of_seed(seed, bumps_by_seed=True, piles=[]).model.mesh_vert
+
+    drawn = [of_seed(seed, bumps_by_seed=True) for seed in (0, 1)]
+    assert drawn[0].true_volume_m3 != pytest.approx(drawn[1].true_volume_m3, rel=1e-6)
+    assert of_seed(1, bumps_by_seed=True).true_volume_m3 == drawn[1].true_volume_m3
+    assert np.abs(walls(0) - walls(1)).max() > 0.1
+    assert np.array_equal(walls(1), walls(1))
+    plain = [of_seed(seed).true_volume_m3 for seed in (0, 1)]
+    assert plain[0] == plain[1]
+    assert drawn[0].config.bumps_by_seed is False  # drawn once
+
+
+def test_bumps_drawn_into_the_ceiling_are_refused_with_their_seed() -> None:
+    world = {"piles": [{**CONE, "height_m": 9.6, "repose_deg": 60, "unevenness_m": 0.5}], "height_m": 10}
+    refused = []
+    for seed in range(12):
+        try:
+            sim_config(world={**world, "bumps_by_seed": True}, seed=seed)
+        except ValueError as error:
+            refused.append((seed, str(error)))
+    assert 0 < len(refused) < 12
+    assert all(f"bumps drawn by seed {seed}" in told and "world.piles.0" in told for seed, told in refused)
