@@ -12,10 +12,11 @@ from companion.messages import Array, PointMap, VolumeReport
 from companion.volume.beams import where_beams_meet
 from companion.volume.contact import Contact, fit_contact
 from companion.volume.doubt import doubt
-from companion.volume.floor import Floor, fit_floor, floor_around, floor_beside, level_floor, waves_m
-from companion.volume.grid import Grid, Index, Mask, cells_of, disc, grid_around
-from companion.volume.interval import RIM_M, Evidence, error_budget, interval
+from companion.volume.floor import Floor, fit_floor, floor_around, floor_beside, floor_beyond, level_floor, waves_m
+from companion.volume.grid import Grid, Index, Mask, grid_around
+from companion.volume.interval import Evidence, error_budget, interval
 from companion.volume.jackknife import cut_in_stretches
+from companion.volume.material import pile_mask
 from companion.volume.objects import LARGEST_CELL_M, Objects, find_objects, on_grid, without_objects
 from companion.volume.poses import pose_errors
 from companion.volume.shadow import Shadow, lay_hidden
@@ -25,8 +26,6 @@ from companion.volume.walls import Footprint, find_footprint
 MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
 
-LEAST_PILE_M = 0.12  # that a heap rises to
-LEAST_FOOT_M = 0.03
 LEAST_FROM_ABOVE = 0.3  # of the map's points
 BESIDE_WALLS_M = 1.0  # beyond the strip
 SLIVERS_M = 0.5  # the same
@@ -162,6 +161,11 @@ def _report(point_map: PointMap, cfg: VolumeConfig, relief: _Relief, objects: Ob
         warnings=(*relief.footprint.warnings, *objects.warnings),
     )
     pile = pile_mask(height, footprint.share > 0, cells, floor, grid)
+    beyond = floor_beyond(floor, grid, cells.x, cells.y, cells.z, pile)
+    if beyond is not floor:
+        shift = np.where(inside, beyond.z(*grid.centres()) - floor_z, 0.0)
+        height, floor_z, floor = height - shift, floor_z + shift, beyond
+        pile = pile_mask(height, footprint.share > 0, cells, floor, grid)
     stretches = cut_in_stretches(point_map, grid, cells, surface, footprint.fit_keyframe)
     halves = None if stretches is None else stretches.halves_m()
     rise, rise_sigma = floor_beside(grid, floor, height, pile, halves)
@@ -222,30 +226,6 @@ def _seen_from_above(point_map: PointMap) -> PointMap:
     height = point_map.path_map[point_map.scan_index, 2]
     keep = height >= 0.5 * np.median(height)
     return point_map.only(keep) if keep.sum() >= LEAST_FROM_ABOVE * len(keep) else point_map
-
-
-def pile_mask(height: Array, inside: Mask, cells: Cells, floor: Floor, grid: Grid) -> Mask:
-    """Where material lies, with a rim of floor all around it.
-
-    The rim (RIM_M) makes the choice free of bias: heights are summed with their sign, and a foot too thin to be told
-    from noise is within the rim.
-    """
-    size = 2 * cells_of(0.25, grid) + 1
-    known = inside.astype(np.float64)
-    smooth = ndimage.uniform_filter(height * known, size, mode="constant")
-    smooth /= np.maximum(ndimage.uniform_filter(known, size, mode="constant"), 1e-9)
-    noise = float(np.nanmedian(cells.sigma_m[cells.seen])) if cells.seen.any() else 0.05
-    least = max(LEAST_PILE_M, 4.0 * noise)
-    label, n = ndimage.label((smooth > least) & inside)
-    area = np.bincount(label.ravel(), minlength=n + 1) * grid.cell_area_m2
-    area[0] = 0.0
-    sure = area[label] >= 1.0
-    # Its foot may run out far: as far as it goes on, above what the floor departs from its plane by.
-    label, n = ndimage.label((smooth > np.clip(3.0 * floor.residual_m, LEAST_FOOT_M, least)) & inside)
-    holds = np.bincount(label.ravel(), sure.ravel(), minlength=n + 1) > 0
-    holds[0] = False
-    core = holds[label]
-    return np.asarray(ndimage.binary_dilation(core, disc(cells_of(RIM_M, grid))) & inside)
 
 
 def _nothing(cfg: VolumeConfig, why: str) -> VolumeReport:

@@ -14,6 +14,7 @@ from companion.volume.grid import Grid, Index, Mask, cells_of, disc, squares
 MAX_SLOPE = 0.12  # steeper than any floor that trucks drive on; loose material at rest is far steeper
 TRIALS = 500
 LEAST_CELLS = 50  # of bare floor, away from all that rises
+LEAST_BEYOND = 0.25  # of the floor's cells, so that those beyond the material tell it
 SURE_SHARE = 0.1  # of all cells, on one plane
 BENT_M = 0.1  # what a floor departs from its plane by, where the attitude that mapped it was off
 FROM_M, TO_M = 1.0, 3.0  # beyond a pile's rim: floor that tells how high it lies beneath; nearer its foot may run out
@@ -69,6 +70,22 @@ def fit_floor(grid: Grid, x: Array, y: Array, z: Array, sigma: Array, usable: Ma
     if _is_toe(grid, index, design, pz, plane, chosen, cells):
         cells, chosen = nothing, np.zeros_like(chosen)
     return _judged(grid, plane, centre, design, pz, chosen, cells, index)
+
+
+def floor_beyond(floor: Floor, grid: Grid, x: Array, y: Array, z: Array, material: Mask) -> Floor:
+    """The same floor told by what of it lies beyond the material, however thin that runs out; as it is where little does.
+
+    x, y, z: (ny, nx) cell centroids. material: (ny, nx), with its rim.
+    """
+    beyond = floor.cells & ~material
+    if not floor.found or beyond.sum() < max(LEAST_CELLS, LEAST_BEYOND * floor.cells.sum()):
+        return floor
+    index = np.flatnonzero(beyond).astype(np.int64)
+    px, py, pz = (v.ravel()[index] for v in (x, y, z))
+    design = np.column_stack([np.ones(len(index)), px - floor.centre_m[0], py - floor.centre_m[1]])
+    plane = np.asarray(np.linalg.lstsq(design, pz, rcond=None)[0], dtype=np.float64)
+    told = _judged(grid, plane, floor.centre_m, design, pz, np.ones(len(index), dtype=np.bool_), beyond, index)
+    return told if told.found else floor
 
 
 def _settled(grid: Grid, index: Index, design: Array, z: Array, plane: Array, tolerance: float) -> tuple[Array, Mask]:

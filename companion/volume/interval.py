@@ -15,16 +15,16 @@ from scipy import ndimage
 
 from companion.messages import Array
 from companion.volume.contact import Contact
-from companion.volume.floor import BLOCK_M, Floor
-from companion.volume.grid import Grid, Index, Mask, cells_of, disc, squares
+from companion.volume.floor import BLOCK_M, FROM_M, TO_M, Floor
+from companion.volume.grid import Grid, Index, Mask, squares
 from companion.volume.keyframes import DRIFTS
+from companion.volume.material import RIM_M
 from companion.volume.poses import PoseErrors
 from companion.volume.surface import Cells, CellState, Surface
 
 LEAST_FLOOR_CELLS = 50
-RIM_M = 1.5  # of floor, around the material
 THIN_M, THIN_REACH_M = 0.001, 2.0  # of loose material that lies about a heap, beyond its rim
-BELL = 1.0 / 6.0  # of the height where the rim begins: what a bell-shaped foot leaves beyond it, in the mean
+STEP_M, SLOWEST = 0.5, 0.8  # along the rim's width; a foot does not run out slower, of a step's height the next has so much
 GAP_M = 4.0  # seen cells so far apart on a gap's rim err on their own
 BESIDE_FLOOR = 0.2  # of an error in height is left where the same scans see the floor around
 
@@ -131,11 +131,32 @@ def _floor(e: Evidence, area: Array) -> float:
 
 def _thin(e: Evidence) -> float:
     """What runs out beyond the rim too thin to be told from floor, or lifts what is taken for floor."""
-    edge = e.pile & ~ndimage.binary_erosion(e.pile) & (e.depth_m > e.grid.cell_m)
-    inner, begin = (ndimage.binary_erosion(e.pile, disc(cells_of(m, e.grid))) for m in (RIM_M, RIM_M - 0.5))
-    foot = begin & ~inner & (e.depth_m > RIM_M) & (e.share > 0)
-    thin_m = max(THIN_M, BELL * float(np.mean(e.height_m[foot]))) if foot.any() else THIN_M
-    return thin_m * THIN_REACH_M * float(edge.sum()) * e.grid.cell_m
+    label, n = ndimage.label(e.pile)
+    from_edge_m = ndimage.distance_transform_edt(e.pile | (e.share <= 0)) * e.grid.cell_m
+    free = e.depth_m > e.grid.cell_m
+    edge = e.pile & ~ndimage.binary_erosion(e.pile) & free
+    out = 0.0
+    for k in range(1, n + 1):
+        own = label == k
+        beyond_m2, lifted_m = _tail(e, own & free & (e.share > 0), from_edge_m)
+        edge_m = float((edge & own).sum()) * e.grid.cell_m
+        out += max(beyond_m2, THIN_M * THIN_REACH_M) * edge_m + lifted_m * e.grid.cell_area_m2 * float(e.share[own].sum())
+    return out
+
+
+def _tail(e: Evidence, own: Mask, from_edge_m: Array) -> tuple[float, float]:
+    """What lies beyond the rim of one pile, for each metre along it, and how high it lies where the floor is told: as its
+    foot runs out within the rim, so it goes on."""
+    bands = [
+        own & (from_edge_m > RIM_M - far) & (from_edge_m <= RIM_M - far + STEP_M) for far in (STEP_M, 2 * STEP_M)
+    ]
+    first, second = (float(np.mean(e.height_m[band])) if band.any() else 0.0 for band in bands)
+    if first <= 0.0 or second <= 0.0:
+        return 0.0, 0.0
+    ratio = min(second / first, SLOWEST)
+    at_edge_m = first * ratio ** (RIM_M / STEP_M)
+    ring = np.arange(FROM_M, TO_M + STEP_M, STEP_M) / STEP_M
+    return at_edge_m * STEP_M / (1.0 - ratio), at_edge_m * float(np.mean(ratio**ring))
 
 
 def _contact_height(e: Evidence, area: Array) -> float:
