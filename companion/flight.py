@@ -42,7 +42,7 @@ from companion.messages import (
 from companion.navigator import Navigator, NavigatorInput, NavigatorOutput
 from companion.navigator.guard import Guard, GuardInput
 from companion.odometry import Odometry, ScanResult
-from companion.odometry.tilt import MOST_TILT_RAD
+from companion.odometry.tilt import LEANS_EVENT, LEANS_IN_WORDS, MOST_TILT_RAD
 from companion.odometry.turned import NOT_KNOWN, TurnedBy
 
 Tap = Callable[[topics.Topic, int, object], None]
@@ -240,10 +240,7 @@ class Flight:
         report = estimate_volume(point_map, self.config.volume, is_cut_short=cut_short)
         said = [self.lidar_turned_by.in_words()] if self.lidar_turned_by.is_sure else []
         if self._leans:
-            said.append(
-                f"the LiDAR leans against the flight controller's attitude by {math.degrees(MOST_TILT_RAD):g} deg or more, "
-                "which is more than is corrected: heights are wrong; check lidar.mount_rpy_deg and fly again"
-            )
+            said.append(LEANS_IN_WORDS)
         return dataclasses.replace(report, warnings=(*report.warnings, *said)) if said else report
 
     # ---- within -----------------------------------------------------------------------------------------------------
@@ -333,7 +330,7 @@ class Flight:
         if max(map(abs, result.tilt_offset_rad)) >= MOST_TILT_RAD and not self._leans:
             self._leans = True
             text = f"LiDAR leans {math.degrees(MOST_TILT_RAD):g} deg or more: check its mount"
-            self.tell(Event(t_ns=t_ns, severity=Severity.CRITICAL, name="lidar_leans", text=text))
+            self.tell(Event(t_ns=t_ns, severity=Severity.CRITICAL, name=LEANS_EVENT, text=text))
         if turned_by.is_sure and not self._has_told_turned:
             self._has_told_turned = True
             text = f"LiDAR is turned by {math.degrees(turned_by.angle_rad):+.1f} deg about the vertical"

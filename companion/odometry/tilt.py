@@ -14,6 +14,11 @@ WALK = 0.0015  # rad per sqrt(s): how fast the attitude's error wanders
 SIGMA_RAD = 0.01  # how large it is thought to be
 FLOOR_RAD = 0.0002
 MOST_TILT_RAD = math.radians(8.0)  # that is corrected
+LEANS_EVENT = "lidar_leans"
+LEANS_IN_WORDS = (
+    f"the LiDAR leans against the flight controller's attitude by {math.degrees(MOST_TILT_RAD):g} deg or more, "
+    "which is more than is corrected: heights are wrong; check lidar.mount_rpy_deg and fly again"
+)
 ELSEWHERE_M = 10.0  # way after which other bumps are in sight
 SHARED_MEMORY = 0.98  # of what is known of the bumps, from scan to scan
 SHARED_POINTS = 500  # on walls, that have to speak of bumps before they are believed in

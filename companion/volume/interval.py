@@ -24,7 +24,10 @@ from companion.volume.surface import Cells, CellState, Surface
 
 LEAST_FLOOR_CELLS = 50
 THIN_M, THIN_REACH_M = 0.001, 2.0  # of loose material that lies about a heap, beyond its rim
-STEP_M, SLOWEST = 0.5, 0.8  # along the rim's width; a foot does not run out slower, of a step's height the next has so much
+STEP_M, SLOWEST = (
+    0.5,
+    0.8,
+)  # along the rim's width; a foot does not run out slower, of a step's height the next has so much
 GAP_M = 4.0  # seen cells so far apart on a gap's rim err on their own
 BESIDE_FLOOR = 0.2  # of an error in height is left where the same scans see the floor around
 
@@ -140,16 +143,16 @@ def _thin(e: Evidence) -> float:
         own = label == k
         beyond_m2, lifted_m = _tail(e, own & free & (e.share > 0), from_edge_m)
         edge_m = float((edge & own).sum()) * e.grid.cell_m
-        out += max(beyond_m2, THIN_M * THIN_REACH_M) * edge_m + lifted_m * e.grid.cell_area_m2 * float(e.share[own].sum())
+        out += max(beyond_m2, THIN_M * THIN_REACH_M) * edge_m + lifted_m * e.grid.cell_area_m2 * float(
+            e.share[own].sum()
+        )
     return out
 
 
 def _tail(e: Evidence, own: Mask, from_edge_m: Array) -> tuple[float, float]:
     """What lies beyond the rim of one pile, for each metre along it, and how high it lies where the floor is told: as its
     foot runs out within the rim, so it goes on."""
-    bands = [
-        own & (from_edge_m > RIM_M - far) & (from_edge_m <= RIM_M - far + STEP_M) for far in (STEP_M, 2 * STEP_M)
-    ]
+    bands = [own & (from_edge_m > RIM_M - far) & (from_edge_m <= RIM_M - far + STEP_M) for far in (STEP_M, 2 * STEP_M)]
     first, second = (float(np.mean(e.height_m[band])) if band.any() else 0.0 for band in bands)
     if first <= 0.0 or second <= 0.0:
         return 0.0, 0.0

@@ -7,8 +7,6 @@ what is sure.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from scipy import ndimage
 
@@ -47,7 +45,9 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, floor: Floor, grid: Gri
     material = _hanging_together(sure, (smooth > np.clip(3.0 * floor.residual_m, LEAST_FOOT_M, least)) & inside)
     cell_sigma_m = max(floor.residual_m, noise)
     for to_side_m in WINDOWS_M:
-        material = _with_its_tail(material, height, inside & cells.seen, cell_sigma_m, floor.undulation_m, grid, to_side_m)
+        material = _with_its_tail(
+            material, height, inside & cells.seen, cell_sigma_m, floor.undulation_m, grid, to_side_m
+        )
     return np.asarray(ndimage.binary_dilation(material, disc(cells_of(RIM_M, grid))) & inside)
 
 

@@ -160,6 +160,8 @@ def test_volume_is_measured_again_in_the_maps_that_were_kept(tmp_path: Path) -> 
     stale["report"]["e_v_percent_perfect_poses"] = 0.1  # of the version that flew it: cannot be told from the map
     stale["report"]["truth_volume_m3"] = made.true_volume_m3
     stale["report"] |= {"lidar_turned_deg": 2.0, "lidar_turned_sigma_deg": 0.4}  # nor can this
+    leans = {"t_s": 9.0, "severity": "CRITICAL", "name": "lidar_leans", "text": "LiDAR leans 8 deg or more"}
+    stale["report"]["events"] = [leans]
     file = tmp_path / f"{runs[0].name}.json"
     file.write_text(json.dumps(stale), encoding="utf-8")
 
@@ -181,6 +183,7 @@ def test_volume_is_measured_again_in_the_maps_that_were_kept(tmp_path: Path) -> 
     assert again["report"]["volume_interval_m3"] == list(volume.interval_m3)
     assert abs(again["report"]["e_v_percent"]) < 2.0
     assert any("turned against each other by +2.0 deg" in w for w in again["report"]["warnings"])
+    assert any("by 8 deg or more, which is more than is corrected" in w for w in again["report"]["warnings"])
     assert "e_v_percent_perfect_poses" not in again["report"]
     assert (again["path_world_m"], again["report"]["e_p_m"]) == (stale["path_world_m"], 0.01)
 
