@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from companion.messages import PointMap
 from companion.volume.floor import Floor
-from companion.volume.interval import Evidence, flank_m2
+from companion.volume.interval import Evidence, flank_m2, gaps_together_m3
 from companion.volume.keyframes import DRIFTS
 from companion.volume.surface import Cells, CellState
 from companion.volume.walls import Footprint
@@ -27,6 +27,7 @@ FLOOR_BENT_M = 0.04  # undulation; power-floated and dozed floors keep within 0.
 FLOOR_SEEN = 0.03  # of the area within the walls
 UNSEEN = 0.05  # of the floor
 UNSEEN_IN_PILE = 0.01
+WIDE_GAP_M, IN_WIDE_GAPS = 0.5, 0.05  # to what was seen; of the pile's own area
 PIT_DEPTH_M = 0.5  # floors do not sink so far
 PIT_M2 = 4.0
 CUT_FACE_M2 = 2.0  # of material on the edge of a map without walls; a heap's foot is all around
@@ -113,6 +114,14 @@ def doubt(
     hidden = float(area[e.pile & (e.surface.state == CellState.UNSEEN)].sum()) / pile_area if pile_area else 0.0
     if hidden > UNSEEN_IN_PILE:
         said.append(f"{100 * hidden:.0f} % of the pile's own area was not seen: its height there is guessed")
+    wide = e.pile & (e.surface.state == CellState.INTERPOLATED) & (e.surface.gap_m > WIDE_GAP_M)
+    in_gaps = float(area[wide].sum()) / pile_area if pile_area else 0.0
+    if in_gaps > IN_WIDE_GAPS:
+        said.append(
+            f"{100 * in_gaps:.0f} % of the pile's own area lies farther than {WIDE_GAP_M:g} m from anything that was seen, on "
+            "straight lines across gaps: scans that are nearer together, or more layers, would show it"
+        )
+        extra.append(gaps_together_m3(e))
     thin = float(np.median(cells.kept[cells.seen])) if cells.seen.any() else 0.0
     if thin < THIN_CELLS:
         said.append(f"the map is thin: {thin:.0f} returns in the median cell of {e.grid.cell_m:g} m")

@@ -186,6 +186,12 @@ def _interpolation(e: Evidence, area: Array) -> tuple[float, float]:
     return out[0], out[1]
 
 
+def gaps_together_m3(e: Evidence) -> float:
+    """What gaps within the piles hold, if all of them err alike: where a good part of a pile lies in gaps, they do."""
+    gaps = (e.surface.state == CellState.INTERPOLATED) & e.pile
+    return roughness(e) * float(np.sum((e.surface.gap_m * e.share)[gaps])) * e.grid.cell_area_m2
+
+
 def _one_error_a_patch(where: Mask, m3: Array, square: Index | None = None) -> float:
     """The sum of m3 over each connected patch, in quadrature; square: (ny, nx), patches are cut along their edges."""
     patch, _ = ndimage.label(where)

@@ -354,3 +354,15 @@ def test_steep_cone_is_material_all_the_same() -> None:
     report, error = measured(make_map(hall, QUICK, 10))
     assert abs(error) < 2.0
     assert not any("upright sides" in w for w in report.warnings)
+
+
+def test_map_with_wide_gaps_says_so_and_is_unsure() -> None:
+    """Rings of five layers, a scan in two seconds: straight lines over a silo's foot all err alike."""
+    hall = Hall(footprint=circle(16.0), pile=cone(5.0, 0.0, 6.0, 0.75))
+    rare, usual = (make_map(hall, dataclasses.replace(QUICK, scan_period_s=period_s), 10) for period_s in (2.0, 0.5))
+    report, _ = measured(rare)
+    assert any("straight lines across gaps" in w for w in report.warnings)
+    assert report.interval_m3[0] <= rare.true_volume_m3 <= report.interval_m3[1]
+    quiet, _ = measured(usual)
+    assert not any("gaps" in w for w in quiet.warnings)
+    assert sigma_of(quiet) < 0.5 * sigma_of(report)
