@@ -60,9 +60,12 @@ def error_budget(e: Evidence) -> dict[str, float]:
     area = e.grid.cell_area_m2 * e.share * e.pile
     flanks = _flanks(e, area)
     gaps, hidden = _interpolation(e, area)
+    returns = _sampling(e, area)
+    spread = e.poses.spread_m3
     return {
-        "returns": _sampling(e, area),
-        "poses": _told_poses(e, float(area.sum())) if e.poses.spread_m3 is None else e.poses.spread_m3,
+        "returns": returns,
+        # Stretches differ by their returns' noise too, which is counted already.
+        "poses": _told_poses(e, float(area.sum())) if spread is None else math.sqrt(max(spread**2 - returns**2, 0.0)),
         "turns": e.poses.turns_m3,
         "range": e.range_offset_sigma_m * abs(_per_range(e, area, flanks)),
         "floor": math.hypot(_floor(e, area), _thin(e)),
