@@ -24,10 +24,8 @@ from companion.volume.surface import Cells, CellState, Surface
 
 LEAST_FLOOR_CELLS = 50
 THIN_M, THIN_REACH_M = 0.001, 2.0  # of loose material that lies about a heap, beyond its rim
-STEP_M, SLOWEST = (
-    0.5,
-    0.8,
-)  # along the rim's width; a foot does not run out slower, of a step's height the next has so much
+STEP_M = 0.5  # across the rim
+SLOWEST = 0.8  # of a step's height the next has so much: slower no foot runs out
 GAP_M = 4.0  # seen cells so far apart on a gap's rim err on their own
 BESIDE_FLOOR = 0.2  # of an error in height is left where the same scans see the floor around
 
@@ -145,10 +143,8 @@ def _thin(e: Evidence) -> float:
     for k in range(1, n + 1):
         own = label == k
         beyond_m2, lifted_m = _tail(e, own & free & (e.share > 0), from_edge_m)
-        edge_m = float((edge & own).sum()) * e.grid.cell_m
-        out += max(beyond_m2, THIN_M * THIN_REACH_M) * edge_m + lifted_m * e.grid.cell_area_m2 * float(
-            e.share[own].sum()
-        )
+        edge_m, area_m2 = float((edge & own).sum()) * e.grid.cell_m, float(e.share[own].sum()) * e.grid.cell_area_m2
+        out += max(beyond_m2, THIN_M * THIN_REACH_M) * edge_m + lifted_m * area_m2
     return out
 
 
