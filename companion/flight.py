@@ -42,7 +42,7 @@ from companion.messages import (
 from companion.navigator import Navigator, NavigatorInput, NavigatorOutput
 from companion.navigator.guard import Guard, GuardInput
 from companion.odometry import Odometry, ScanResult
-from companion.odometry.tilt import LEANS_EVENT, LEANS_IN_WORDS, MOST_TILT_RAD
+from companion.odometry.tilt import LEANS_EVENT, MOST_TILT_RAD, mount_warnings
 from companion.odometry.turned import NOT_KNOWN, TurnedBy
 
 Tap = Callable[[topics.Topic, int, object], None]
@@ -238,10 +238,8 @@ class Flight:
         if point_map is None:
             point_map = self.mapper.point_map()
         report = estimate_volume(point_map, self.config.volume, is_cut_short=cut_short)
-        said = [self.lidar_turned_by.in_words()] if self.lidar_turned_by.is_sure else []
-        if self._leans:
-            said.append(LEANS_IN_WORDS)
-        return dataclasses.replace(report, warnings=(*report.warnings, *said)) if said else report
+        said = mount_warnings(self.lidar_turned_by, leans=self._leans)
+        return dataclasses.replace(report, warnings=(*report.warnings, *said))
 
     # ---- within -----------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from companion.config import Section
 from companion.errors import ConfigError
 from companion.mapping.export import load_point_map, save_point_map
-from companion.odometry.tilt import LEANS_EVENT, LEANS_IN_WORDS
+from companion.odometry.tilt import LEANS_EVENT, mount_warnings
 from companion.odometry.turned import TurnedBy
 from stockpilot.files import write_json
 from stockpilot.mission import load_mission
@@ -146,10 +146,8 @@ def measure_run(run: SweepRun, *, result: dict[str, Any], map_file: Path) -> dic
     turned_by = TurnedBy(
         *(math.radians(report.get(key, math.inf)) for key in ("lidar_turned_deg", "lidar_turned_sigma_deg"))
     )
-    said = [turned_by.in_words()] if turned_by.is_sure else []
-    if any(event["name"] == LEANS_EVENT for event in report.get("events", ())):
-        said.append(LEANS_IN_WORDS)
-    volume = replace(volume, warnings=(*volume.warnings, *said))
+    leans = any(event["name"] == LEANS_EVENT for event in report.get("events", ()))
+    volume = replace(volume, warnings=(*volume.warnings, *mount_warnings(turned_by, leans=leans)))
     return {**result, "report": {**report, **volume_scores(volume, report["truth_volume_m3"])}}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from companion.messages import Array
 from companion.odometry.height_map import HeightFit
-from companion.odometry.turned import Turned
+from companion.odometry.turned import Turned, TurnedBy
 
 WALK = 0.0015  # rad per sqrt(s): how fast the attitude's error wanders
 SIGMA_RAD = 0.01  # how large it is thought to be
@@ -24,6 +24,12 @@ SHARED_MEMORY = 0.98  # of what is known of the bumps, from scan to scan
 SHARED_POINTS = 500  # on walls, that have to speak of bumps before they are believed in
 # variance of the tilt over what sectors tell: bumps longer than a sector is wide, and what the fit hides
 LONG_BUMPS = 4.0
+
+
+def mount_warnings(turned_by: TurnedBy, *, leans: bool) -> tuple[str, ...]:
+    """What must stand beside a volume of a LiDAR that does not sit as its mount says. leans: by more than is corrected."""
+    said = [turned_by.in_words()] if turned_by.is_sure else []
+    return (*said, LEANS_IN_WORDS) if leans else tuple(said)
 
 
 class Tilt:

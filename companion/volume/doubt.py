@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from companion.messages import PointMap
 from companion.volume.floor import Floor
+from companion.volume.grid import Mask
 from companion.volume.interval import Evidence, flank_m2, gaps_together_m3
 from companion.volume.keyframes import DRIFTS
 from companion.volume.surface import Cells, CellState
@@ -111,11 +112,14 @@ def doubt(
         said.append(f"the floor departs from a plane by {floor.undulation_m:.2f} m (1 sigma) over a few metres")
     if unseen > UNSEEN:
         said.append(f"{100 * unseen:.0f} % of the floor was not seen: what lies there is guessed from its surroundings")
-    hidden = float(area[e.pile & (e.surface.state == CellState.UNSEEN)].sum()) / pile_area if pile_area else 0.0
+
+    def share_of_pile(where: Mask) -> float:
+        return float(area[e.pile & where].sum()) / pile_area if pile_area else 0.0
+
+    hidden = share_of_pile(e.surface.state == CellState.UNSEEN)
     if hidden > UNSEEN_IN_PILE:
         said.append(f"{100 * hidden:.0f} % of the pile's own area was not seen: its height there is guessed")
-    wide = e.pile & (e.surface.state == CellState.INTERPOLATED) & (e.surface.gap_m > WIDE_GAP_M)
-    in_gaps = float(area[wide].sum()) / pile_area if pile_area else 0.0
+    in_gaps = share_of_pile((e.surface.state == CellState.INTERPOLATED) & (e.surface.gap_m > WIDE_GAP_M))
     if in_gaps > IN_WIDE_GAPS:
         said.append(
             f"{100 * in_gaps:.0f} % of the pile's own area lies farther than {WIDE_GAP_M:g} m from anything that was seen, on "

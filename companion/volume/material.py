@@ -42,7 +42,8 @@ def pile_mask(height: Array, inside: Mask, cells: Cells, floor: Floor, grid: Gri
     area[0] = 0.0
     sure = area[label] >= LEAST_PILE_M2
     # Its foot may run out far: as far as it goes on, above what the floor departs from its plane by.
-    material = _hanging_together(sure, (smooth > np.clip(3.0 * floor.residual_m, LEAST_FOOT_M, least)) & inside)
+    foot = (smooth > np.clip(3.0 * floor.residual_m, LEAST_FOOT_M, least)) & inside
+    material = np.asarray(ndimage.binary_propagation(sure, mask=foot))
     cell_sigma_m = max(floor.residual_m, noise)
     for to_side_m in WINDOWS_M:
         material = _with_its_tail(
@@ -65,12 +66,4 @@ def _with_its_tail(
     count = share * size**2
     sigma = np.sqrt(cell_sigma_m**2 / np.maximum(count, 1.0) + waves_m**2)
     tail = (mean > np.maximum(SURE_SIGMA * sigma, LEAST_TAIL_M)) & (count >= LEAST_CELLS) & (beside > 0)
-    return _hanging_together(material, material | tail)
-
-
-def _hanging_together(sure: Mask, wanted: Mask) -> Mask:
-    """Of the connected parts of `wanted` those that hold any of `sure`."""
-    label, n = ndimage.label(wanted)
-    holds = np.bincount(label.ravel(), sure.ravel(), minlength=n + 1) > 0
-    holds[0] = False
-    return np.asarray(holds[label])
+    return np.asarray(ndimage.binary_propagation(material, mask=material | tail))
