@@ -29,6 +29,7 @@ PARTS = {
     "returns": "noise of single returns",
     "poses": "errors of the poses, as stretches of the flight differ",
     "turns": "turns that round walls do not show",
+    "scale": "walls that lie elsewhere when seen from afar",
     "range": "offset of the sensor's range",
     "floor": "the floor under the pile",
     "walls": "where the pile meets the walls",

@@ -12,6 +12,7 @@ import pytest
 from pymavlink import mavutil
 
 from companion.messages import RequestKind
+from simbridge.streams import stream
 from stockpilot.leave import write_results
 from stockpilot.lockstep import Lockstep
 from stockpilot.mission import Mission
@@ -64,6 +65,23 @@ def test_position_and_volume_are_near_the_truth_and_the_interval_holds_it(flown:
     assert abs(report["e_v_percent"]) <= 3.0
     assert report["truth_in_interval"]
     assert report["seen_ratio"] + report["interpolated_ratio"] + report["unseen_ratio"] == pytest.approx(1.0)
+
+
+@pytest.mark.timeout(300)
+def test_a_sensor_that_reads_too_far_moves_the_volume_as_the_interval_says(flown: Flown) -> None:
+    """The same flight with 30 mm more in all ranges: the odometry bends the map with it, and the volume follows that."""
+    offset_m = 0.03
+    drawn = float(stream(flown.mission.seed, "lidar offset").standard_normal())
+    assert drawn < 0.0
+    off = fly_lockstep(small_mission(lidar={"offset_sigma_m": offset_m / drawn * -1.0}))
+    assert flown.mission.sim is not None
+    own_m = flown.mission.sim.lidar.offset_sigma_m * drawn
+    assert off.scored.volume is not None
+    assert flown.scored.volume is not None
+    moved_m3 = off.scored.volume.volume_m3 - flown.scored.volume.volume_m3
+    sigma_m3 = dict(flown.scored.volume.error_budget_m3)["range"]
+    told_m2 = sigma_m3 / flown.mission.companion.volume.range_offset_sigma_m
+    assert abs(moved_m3) / (offset_m + own_m) == pytest.approx(told_m2, rel=0.35)
 
 
 @pytest.mark.timeout(300)

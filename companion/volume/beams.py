@@ -61,7 +61,6 @@ def _moved(cells: Cells, sums: Array, grid: Grid, whole: Mask) -> Cells:
     n = sums[..., 0]
     with np.errstate(invalid="ignore", divide="ignore"):
         x, y, z = (sums[..., k] / n for k in (1, 2, 3))
-        rise = sums[..., 4] / n
     use = whole & (n >= LEAST_BEAMS)
     # Between two that beams meet, what came where none does was thrown there by its noise: a straight line is better.
     # Wider gaps may hide a foot, which no straight line follows.
@@ -73,7 +72,6 @@ def _moved(cells: Cells, sums: Array, grid: Grid, whole: Mask) -> Cells:
         y=np.where(none, np.nan, np.where(use, y + cy, cells.y)),
         z=np.where(none, np.nan, np.where(use, z, cells.z)),
         kept=np.where(none, 0.0, np.where(use, np.maximum(n, MIN_POINTS), cells.kept)),
-        rise=np.where(n >= MIN_POINTS, rise, np.nan),
     )
 
 
@@ -89,15 +87,14 @@ def _gather(
     grid: Array,
     furthest_m: float,
 ) -> tuple[Array, Index, Array]:
-    """(ny, nx, 5): how many beams meet each cell; times that: their mean place from its centre (2), height, and how fast
-    that rises with their ranges. (N,): flat cell in which each beam meets the surface, -1 where it does not; how far its
-    return then lies above the plane, m.
+    """(ny, nx, 4): how many beams meet each cell; times that: their mean place from its centre (2) and height. (N,): flat cell
+    in which each beam meets the surface, -1 where it does not; how far its return then lies above the plane, m.
 
     points, beams: (N, 3), unit. cell_of: (N,) flat cells where they came. known, z, slope_x, slope_y: (ny, nx) planes at the
     cells' centres. grid: x0, y0, cell.
     """
     ny, nx = z.shape
-    sums = np.zeros((ny, nx, 5))
+    sums = np.zeros((ny, nx, 4))
     cell, over = np.full(len(points), -1), np.zeros(len(points))
     for n in range(len(points)):
         i, j = cell_of[n] // nx, cell_of[n] % nx
@@ -132,6 +129,5 @@ def _gather(
         sums[i, j, 1] += dx
         sums[i, j, 2] += dy
         sums[i, j, 3] += z[i, j] + slope_x[i, j] * dx + slope_y[i, j] * dy - along * rate
-        sums[i, j, 4] += rate
         cell[n], over[n] = i * nx + j, -along * rate
     return sums, cell, over

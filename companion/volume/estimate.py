@@ -10,6 +10,7 @@ from scipy import ndimage
 from companion.config import VolumeConfig
 from companion.messages import Array, PointMap, VolumeReport
 from companion.volume.beams import where_beams_meet
+from companion.volume.bending import bending
 from companion.volume.contact import Contact, fit_contact
 from companion.volume.doubt import doubt
 from companion.volume.floor import Floor, fit_floor, floor_around, floor_beside, floor_beyond, level_floor, waves_m
@@ -18,10 +19,10 @@ from companion.volume.interval import Evidence, error_budget, interval
 from companion.volume.jackknife import cut_in_stretches
 from companion.volume.material import pile_mask
 from companion.volume.objects import LARGEST_CELL_M, Objects, find_objects, on_grid, without_objects
-from companion.volume.poses import pose_errors
+from companion.volume.poses import pose_errors, wall_faces
 from companion.volume.shadow import Shadow, lay_hidden
 from companion.volume.surface import Cells, CellState, Surface, build_surface, robust_cells, without_strays
-from companion.volume.walls import Footprint, find_footprint
+from companion.volume.walls import UNMEASURED, Footprint, find_footprint
 
 MIN_MAP_POINTS = 200
 INTERPOLATION_REACH_M = 2.0  # up to here from a seen cell a height is called interpolated, beyond it unseen
@@ -174,7 +175,9 @@ def _report(point_map: PointMap, cfg: VolumeConfig, relief: _Relief, objects: Ob
     area = grid.cell_area_m2 * footprint.share
     volume = float(np.sum((height * area)[pile]))
     rings = [(own, ring if ring.any() else floor.cells) for own, ring in floor_around(grid, floor, pile)]
-    poses = pose_errors(point_map, grid, cells, surface, footprint, floor, stretches, area * pile, rings, height)
+    faces = wall_faces(footprint, grid, (area * pile) > 0.0, height)
+    poses = pose_errors(point_map, grid, cells, surface, footprint, floor, stretches, area * pile, rings, faces)
+    bent = bending(point_map, grid, cells, surface, footprint, floor, area * pile, rings, faces)
     evidence = Evidence(
         grid=grid,
         cells=cells,
@@ -186,10 +189,12 @@ def _report(point_map: PointMap, cfg: VolumeConfig, relief: _Relief, objects: Ob
         waves_m=waves,
         height_m=height,
         share=footprint.share,
+        cut_unsure=np.where(objects.share > 0, UNMEASURED, footprint.cut_unsure),
         pile=pile,
         depth_m=footprint.depth_m,
         poses=poses,
         range_offset_sigma_m=cfg.range_offset_sigma_m,
+        bending=bent,
         position_sigma_m=point_map.position_sigma_m,
         height_sigma_m=point_map.height_sigma_m,
         wall_sigma_m=float(np.hypot(footprint.fit_sigma_m, LEAST_WALL_SIGMA_M)) if footprint.has_walls else 0.0,

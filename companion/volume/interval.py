@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from companion.messages import Array
+from companion.volume.bending import Bending
 from companion.volume.contact import Contact
 from companion.volume.floor import BLOCK_M, FROM_M, TO_M, Floor
 from companion.volume.grid import Grid, Index, Mask, squares
@@ -22,17 +23,17 @@ from companion.volume.material import RIM_M
 from companion.volume.poses import PoseErrors
 from companion.volume.surface import Cells, CellState, Surface
 
-LEAST_FLOOR_CELLS = 50
-THIN_M, THIN_REACH_M = 0.001, 2.0  # of loose material that lies about a heap, beyond its rim
 STEP_M = 0.5  # across the rim
 SLOWEST = 0.8  # of a step's height the next has so much: slower no foot runs out
 GAP_M = 4.0  # seen cells so far apart on a gap's rim err on their own
+CONTRADICTED = 0.5  # of what walls would change of the volume: the truth lies between them and the odometry
 BESIDE_FLOOR = 0.2  # of an error in height is left where the same scans see the floor around
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """All that the error budget looks at. position_sigma_m, height_sigma_m: as told by the odometry."""
+    """All that the error budget looks at. position_sigma_m, height_sigma_m: as told by the odometry.
+    bending: None where the map does not tell its beams."""
 
     grid: Grid
     cells: Cells
@@ -44,10 +45,12 @@ class Evidence:
     waves_m: float
     height_m: Array
     share: Array
+    cut_unsure: Array
     pile: Mask
     depth_m: Array
     poses: PoseErrors
     range_offset_sigma_m: float
+    bending: Bending | None
     position_sigma_m: float
     height_sigma_m: float
     wall_sigma_m: float
@@ -56,7 +59,9 @@ class Evidence:
 def error_budget(e: Evidence) -> dict[str, float]:
     """1 sigma of each part, m3."""
     area = e.grid.cell_area_m2 * e.share * e.pile
-    flanks = _flanks(e, area)
+    per_range = None if e.bending is None else e.bending.per_range_m2
+    if per_range is None:
+        per_range = _guessed_per_range(area, _flanks(e, area))
     gaps, hidden = _interpolation(e, area)
     returns = _sampling(e, area)
     spread = e.poses.spread_m3
@@ -65,7 +70,8 @@ def error_budget(e: Evidence) -> dict[str, float]:
         # Stretches differ by their returns' noise too, which is counted already.
         "poses": _told_poses(e, float(area.sum())) if spread is None else math.sqrt(max(spread**2 - returns**2, 0.0)),
         "turns": e.poses.turns_m3,
-        "range": e.range_offset_sigma_m * abs(_per_range(e, area, flanks)),
+        "scale": 0.0 if e.bending is None else CONTRADICTED * abs(e.bending.contradicted_m3),
+        "range": e.range_offset_sigma_m * abs(per_range),
         "floor": math.hypot(_floor(e, area), _thin(e)),
         # Who maps the wall is not who maps what lies on it: a slow drift between them shows in no stretch.
         "walls": math.hypot(e.wall_sigma_m, e.position_sigma_m) * e.poses.face_m2,
@@ -105,19 +111,9 @@ def _flanks(e: Evidence, area: Array) -> tuple[float, float, float, float]:
     return a, b, c, d
 
 
-def _per_range(e: Evidence, area: Array, flanks: tuple[float, ...]) -> float:
-    """Volume that a metre added to all ranges adds: the pile sinks along its beams, and so does the floor below it."""
-    rise = np.full(e.grid.shape, np.nan) if e.cells.rise is None else e.cells.rise
-    on_floor = e.floor.cells & np.isfinite(rise)
-    if on_floor.sum() < LEAST_FLOOR_CELLS:
-        return 0.3 * float(area.sum()) + 0.7 * sum(flanks)  # beams 20 to 45 deg down, from all sides
-    x, y = e.grid.centres()
-    design = np.stack([np.ones(e.grid.shape), x, y], axis=-1)
-    plane = np.linalg.lstsq(design[on_floor], rise[on_floor], rcond=None)[0]
-    known = np.isfinite(rise) & e.pile
-    seen = float(area[known].sum())
-    moved = float(np.sum((area * (rise - design @ plane))[known]))
-    return moved * float(area.sum()) / seen if seen > 0 else 0.0
+def _guessed_per_range(area: Array, flanks: tuple[float, ...]) -> float:
+    """Volume that a metre added to all ranges adds, where the map does not tell it: beams 20 to 45 deg down, from all sides."""
+    return 0.3 * float(area.sum()) + 0.7 * sum(flanks)
 
 
 def _floor(e: Evidence, area: Array) -> float:
@@ -134,7 +130,8 @@ def _floor(e: Evidence, area: Array) -> float:
 
 
 def _thin(e: Evidence) -> float:
-    """What runs out beyond the rim too thin to be told from floor, or lifts what is taken for floor."""
+    """What runs out beyond the rim too thin to be told from floor, or lifts what is taken for floor, where a foot does run out:
+    dust on a floor is not material."""
     label, n = ndimage.label(e.pile)
     from_edge_m = ndimage.distance_transform_edt(e.pile | (e.share <= 0)) * e.grid.cell_m
     free = e.depth_m > e.grid.cell_m
@@ -144,7 +141,7 @@ def _thin(e: Evidence) -> float:
         own = label == k
         beyond_m2, lifted_m = _tail(e, own & free & (e.share > 0), from_edge_m)
         edge_m, area_m2 = float((edge & own).sum()) * e.grid.cell_m, float(e.share[own].sum()) * e.grid.cell_area_m2
-        out += max(beyond_m2, THIN_M * THIN_REACH_M) * edge_m + lifted_m * area_m2
+        out += beyond_m2 * edge_m + lifted_m * area_m2
     return out
 
 
@@ -222,8 +219,7 @@ def roughness(e: Evidence) -> float:
 
 
 def _obstacles(e: Evidence) -> float:
-    """What each obstacle's foot would hold at the pile's height there, where one stands in the pile: anything from
-    nothing to all of it."""
+    """What the obstacles that stand in the pile take from it, by how well the foot of each is known."""
     inside = e.pile & (e.share < 1.0) & (e.depth_m > 2 * e.grid.cell_m)
-    cut = np.where(inside, (1.0 - e.share) * e.grid.cell_area_m2 * np.maximum(e.height_m, 0.0), 0.0)
-    return _one_error_a_patch(inside, cut) / math.sqrt(12.0)
+    cut = (1.0 - e.share) * e.cut_unsure * e.grid.cell_area_m2 * np.maximum(e.height_m, 0.0)
+    return _one_error_a_patch(inside, np.where(inside, cut, 0.0))

@@ -34,13 +34,13 @@ class PoseErrors:
 
 def pose_errors(
     point_map: PointMap, grid: Grid, cells: Cells, surface: Surface, footprint: Footprint, floor: Floor,
-    stretches: Stretches | None, pile_m2: Array, piles: Sequence[tuple[Mask, Mask]], height_m: Array,
+    stretches: Stretches | None, pile_m2: Array, piles: Sequence[tuple[Mask, Mask]], faces: Sequence[tuple[EdgeFit, float]],
 ) -> PoseErrors:  # fmt: skip
-    """pile_m2: (ny, nx) of the material's cells. piles: of each its cells and those of the floor that tells its height."""
+    """pile_m2: (ny, nx) of the material's cells. piles: of each its cells and those of the floor that tells its height.
+    faces: see `wall_faces`."""
     flown = np.unique(point_map.keyframe_id)
     of_floor, floor_noise = floor_by_keyframe(point_map, cells, floor, flown)
     seen_floor = of_floor[np.isfinite(of_floor)]
-    faces = _faces(footprint, grid, pile_m2 > 0.0, height_m)
     spread = None
     if stretches is not None:
         of_walls = [
@@ -70,7 +70,7 @@ def floor_by_keyframe(point_map: PointMap, cells: Cells, floor: Floor, flown: In
     return means, float(np.sqrt(np.mean(np.var(r) / n))) if len(n) else 0.0
 
 
-def _faces(footprint: Footprint, grid: Grid, pile: Mask, height: Array) -> list[tuple[EdgeFit, float]]:
+def wall_faces(footprint: Footprint, grid: Grid, pile: Mask, height: Array) -> list[tuple[EdgeFit, float]]:
     """The stretches of wall that material lies against, with the face of it at each, m2."""
     band = (np.abs(footprint.depth_m) < grid.cell_m) & (footprint.share > 0) & pile & (height > 0)
     if not footprint.fits or not band.any():

@@ -33,7 +33,6 @@ class Cells:
 
     sigma_m: 1 sigma of z from the spread of the returns. kept: how many returns. dropped_ratio: share of all returns
     that hung in the air or lay far off the surface. of_point: for each point its cell when kept, else -1.
-    rise: metres by which z rises for a metre added to the ranges; NaN where no beams were told.
     meets_in, above_m: (N,) cell in which each kept point's beam meets the surface, -1 for none, and how far the point then
     lies above it; None where no beams were told.
     """
@@ -45,7 +44,6 @@ class Cells:
     kept: Array
     dropped_ratio: float
     of_point: Index
-    rise: Array | None = None
     meets_in: Index | None = None
     above_m: Array | None = None
 

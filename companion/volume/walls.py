@@ -13,6 +13,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from companion.messages import Array, PointMap
+from companion.volume.columns import measure_column
 from companion.volume.edges import EdgeFit, fit_edges, pose_disagreement
 from companion.volume.grid import Grid, Index, Mask, cells_of, disc
 from companion.volume.polygon import contains, coverage, edge_distance, outline, resample
@@ -22,6 +23,8 @@ UPRIGHT_SPREAD_M = 1.2  # height spread over one cell that no slope of loose mat
 BRIDGED_GAPS_M = (0.75, 1.5, 3.0)  # holes in the walls that are still closed, tried in this order
 MAX_FIT_POINTS = 150_000
 FILLED_LEVELS = (0.1, 0.2, 0.4, 0.03)  # how full a wall's cell is against the fullest; dust fills few cells so well
+UNMEASURED = 1.0 / 12.0**0.5  # 1 sigma of what an obstacle's foot holds: anything from nothing to all of it
+LEAST_SHARE = 0.01  # of a cell that an obstacle covers: it stays one within the walls
 WITHIN_ENOUGH = 0.97  # share of all returns that true walls hold in, but for noise and open doors
 
 
@@ -30,16 +33,18 @@ class Footprint:
     """What the walls enclose.
 
     polygon_m: (V, 2) counter-clockwise, in map. has_walls: False where the map's own extent had to do.
-    share: (ny, nx) part of each cell inside the walls and outside obstacles. depth_m: (ny, nx) distance to the
-    nearest wall, negative outside. blocked: cells whose returns belong to obstacles. noise_m: 1 sigma of wall returns
-    about the fitted walls. fit_sigma_m: of the walls' own place. pose_sigma_m: how far single keyframes disagree on it;
-    NaN where it cannot be told. fits: the stretches of wall; fit_keyframe: (F,) of the points that they were fitted to.
-    beyond_ratio: share of all returns that lie beyond the walls, farther than noise throws them.
+    share: (ny, nx) part of each cell inside the walls and outside obstacles. cut_unsure: (ny, nx) 1 sigma of what obstacles
+    cut from it, over that. depth_m: (ny, nx) distance to the nearest wall, negative outside. blocked: cells whose
+    returns belong to obstacles. noise_m: 1 sigma of wall returns about the fitted walls. fit_sigma_m: of the walls' own
+    place. pose_sigma_m: how far single keyframes disagree on it; NaN where it cannot be told. fits: the stretches of wall;
+    fit_keyframe: (F,) of the points that they were fitted to. beyond_ratio: share of all returns that lie beyond the walls,
+    farther than noise throws them.
     """
 
     polygon_m: Array
     has_walls: bool
     share: Array
+    cut_unsure: Array
     depth_m: Array
     blocked: Mask
     noise_m: float
@@ -173,6 +178,7 @@ def _open_footprint(grid: Grid, key: Index, ceiling: float) -> Footprint:
         polygon_m=outline(region, grid),
         has_walls=False,
         share=region.astype(np.float64),
+        cut_unsure=np.full(grid.shape, UNMEASURED),
         depth_m=np.where(region, depth, -grid.cell_m),
         blocked=np.zeros(grid.shape, dtype=np.bool_),
         noise_m=0.0,
@@ -204,6 +210,7 @@ def _closed_footprint(
         polygon_m=polygon,
         has_walls=True,
         share=coverage(polygon, grid),
+        cut_unsure=np.full(grid.shape, UNMEASURED),
         depth_m=depth,
         blocked=np.zeros(grid.shape, dtype=np.bool_),
         noise_m=noise,
@@ -215,7 +222,7 @@ def _closed_footprint(
         beyond_ratio=0.0,
         warnings=(),
     )
-    return _cut_obstacles(footprint, point_map.points_map, grid, key, structure)
+    return _cut_obstacles(footprint, point_map.points_map, grid, key, structure, upright)
 
 
 def _pull_to_wall(loop: Array, points: Array) -> tuple[Array, float]:
@@ -247,14 +254,18 @@ def _pull_to_wall(loop: Array, points: Array) -> tuple[Array, float]:
     return fine, float(np.median(spreads)) if spreads else 0.1
 
 
-def _cut_obstacles(footprint: Footprint, points: Array, grid: Grid, key: Index, structure: Mask) -> Footprint:
+def _cut_obstacles(
+    footprint: Footprint, points: Array, grid: Grid, key: Index, structure: Mask, upright: Mask
+) -> Footprint:
     """Columns and the like: upright things inside the walls. Their returns go, and the floor that they cover."""
     free_of_wall = footprint.depth_m > footprint.margin_m + grid.cell_m
     label, n = ndimage.label(structure & free_of_wall, np.ones((3, 3)))
     if n == 0:
         return footprint
     blocked = np.zeros(grid.shape, dtype=np.bool_)
-    share, warnings = footprint.share.copy(), list(footprint.warnings)
+    share, unsure = footprint.share.copy(), footprint.cut_unsure.copy()
+    warnings = list(footprint.warnings)
+    standing = points[upright, :2]
     at = label.ravel()[np.maximum(key, 0)] * (key >= 0)
     for i in range(1, n + 1):
         z = points[at == i, 2]
@@ -267,10 +278,16 @@ def _cut_obstacles(footprint: Footprint, points: Array, grid: Grid, key: Index, 
                     f"y {grid.y0_m + y:.1f} m: what is hidden behind it is not known"
                 )
             continue
+        blocked |= ndimage.binary_dilation(ndimage.binary_fill_holes(body), disc(cells_of(footprint.margin_m, grid)))
+        column = measure_column(points[(at == i) & upright, :2], standing, footprint.noise_m)
+        if column is not None:
+            covered = coverage(column.outline_m, grid)
+            share *= np.maximum(1.0 - covered, LEAST_SHARE)
+            unsure[covered > 0] = column.sigma_m2 / column.area_m2
+            continue
         body = ndimage.binary_fill_holes(body)
         cells_area = float(body.sum()) * grid.cell_area_m2
         radius = np.sqrt(cells_area / np.pi)
         true_radius = max(radius - 1.2 * footprint.noise_m - 0.3 * grid.cell_m, 0.3 * radius)
         share[body] *= 1.0 - (true_radius / radius) ** 2
-        blocked |= ndimage.binary_dilation(body, disc(cells_of(footprint.margin_m, grid)))
-    return replace(footprint, share=share, blocked=blocked, warnings=tuple(warnings))
+    return replace(footprint, share=share, cut_unsure=unsure, blocked=blocked, warnings=tuple(warnings))
