@@ -6,6 +6,7 @@ Each folder is one that `stockpilot sweep` wrote. Printed: for each sweep and fo
 many of them the interval holds the truth, with the 95 % range that this count leaves for the ratio (Clopper and Pearson,
 Biometrika 1934), how many that do not hold it carry no warning, and the errors over 1 sigma, RMS (1 where the interval is just as
 wide as it should be). Flights of one world err alike: what holds in many worlds says more than what holds in many flights of one.
+With --by-world the flights of all folders are told by their world instead: what they err by, and what the interval is made of.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from stockpilot.sweep_report import fill_block, interval_scores, is_confident_an
 
 Report = dict[str, Any]
 WANTED = (0.90, 0.99)
+PARTS_TOLD = 4  # of the interval, the largest first
 
 
 def reports_of(folder: Path) -> list[Report]:
@@ -56,6 +58,26 @@ def row(name: str, reports: Sequence[Report]) -> dict[str, Any]:
     }
 
 
+def world_row(name: str, reports: Sequence[Report]) -> dict[str, Any]:
+    """What is said of one world's flights whose interval has two ends, in percent of the volume."""
+    scored = [(r, s["error_over_sigma"]) for r in reports if (s := interval_scores(r))]
+    error = np.array([100.0 * (r["volume_m3"] / r["truth_volume_m3"] - 1.0) for r, _ in scored])
+    parts: dict[str, float] = {}
+    for r, _ in scored:
+        for part, sigma_m3 in (r.get("error_budget_m3") or {}).items():
+            parts[part] = parts.get(part, 0.0) + (100.0 * sigma_m3 / r["truth_volume_m3"]) ** 2 / len(scored)
+    largest = sorted((p for p in parts if parts[p] > 0.0), key=lambda part: -parts[part])[:PARTS_TOLD]
+    return {
+        "world": name,
+        "flights": len(scored),
+        "inside": sum(bool(r.get("truth_in_interval")) for r, _ in scored),
+        "error, %, mean": float(error.mean()) if len(error) else math.nan,
+        "error, %, RMS": rms(error) if len(error) else math.nan,
+        "error over 1 sigma, RMS": rms(np.array([z for _, z in scored])) if scored else math.nan,
+        "largest parts of 1 sigma, %": ", ".join(f"{part} {math.sqrt(parts[part]):.3f}" for part in largest),
+    }
+
+
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Markdown."""
     lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
@@ -68,6 +90,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", help="folders of sweeps")
+    parser.add_argument(
+        "--by-world", action="store_true", help="a row for each world; its block is `coverage_by_world`"
+    )
     parser.add_argument("--docs", type=Path, help="fill this document's block `coverage`")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
@@ -75,8 +100,17 @@ def main() -> None:
         by_sweep = {folder: reports_of(folder) for folder in args.folders}
     except ConfigError as error:
         parser.error(str(error))
+    every = [report for reports in by_sweep.values() for report in reports]
+    if args.by_world:
+        worlds = sorted({str(report.get("mission")) for report in every})
+        of_worlds = [world_row(world, [r for r in every if str(r.get("mission")) == world]) for world in worlds]
+        if args.docs is not None:
+            command = f"`python -m benchmarks.coverage --by-world {' '.join(map(str, args.folders))}`"
+            fill_block(args.docs, "coverage_by_world", f"{command}\n\n{table(of_worlds)}")
+        print(json.dumps(of_worlds, indent=2) if args.json else table(of_worlds))
+        return
     rows = [row(str(folder), reports) for folder, reports in by_sweep.items()]
-    rows.append(row("all", [report for reports in by_sweep.values() for report in reports]))
+    rows.append(row("all", every))
     if args.docs is not None:
         command = f"`python -m benchmarks.coverage {' '.join(map(str, args.folders))}`"
         fill_block(args.docs, "coverage", f"{command}\n\n{table(rows)}")

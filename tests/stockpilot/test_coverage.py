@@ -60,3 +60,26 @@ def test_table_of_several_sweeps_goes_into_a_document(tmp_path: Path, monkeypatc
     assert "old" not in text
     with pytest.raises(ConfigError, match="nothing: begin"):
         fill_block(document, "nothing", "text")
+
+
+def test_worlds_are_told_apart_with_what_their_intervals_are_made_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    hall = {
+        **report(102.0, inside=False),
+        "mission": "hall",
+        "error_budget_m3": {"poses": 0.8, "floor": 0.6, "doubt": 0.0},
+    }
+    silo = {**report(99.0, inside=True), "mission": "silo", "error_budget_m3": {"poses": 0.5}}
+    folder = sweep(
+        tmp_path / "a", [hall, {**hall, "volume_m3": 98.0}, silo, {**report(None, inside=False), "mission": "silo"}]
+    )
+    document = tmp_path / "results.md"
+    document.write_text("<!-- coverage_by_world: begin -->\n<!-- coverage_by_world: end -->\n")
+    monkeypatch.setattr(sys, "argv", ["coverage", "--by-world", str(folder), "--docs", str(document)])
+    coverage.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].startswith("| hall | 2 | 0 | 0 | 2 |")
+    assert lines[2].endswith("| poses 0.800, floor 0.600 |")
+    assert lines[3].startswith("| silo | 1 | 1 | -1 | 1 | 1 |")
+    assert "| silo | 1 | 1 |" in document.read_text()
