@@ -119,9 +119,9 @@ def _returns(point_map: PointMap, cells: Cells) -> _Returns | None:
     chosen = np.flatnonzero(np.random.default_rng(0).random(count) * count < MOST_RETURNS)
     points = point_map.points_map[chosen]
     reach = points - point_map.path_map[point_map.scan_index[chosen]]
-    flown, keyframe = np.unique(point_map.keyframe_id[chosen], return_inverse=True)
+    flown = np.unique(point_map.keyframe_id)
     return _Returns(
-        keyframe=keyframe,
+        keyframe=np.searchsorted(flown, point_map.keyframe_id[chosen]),
         keyframes=len(flown),
         point=points,
         beam=reach / np.maximum(np.linalg.norm(reach, axis=1), 1e-9)[:, None],
@@ -132,14 +132,14 @@ def _returns(point_map: PointMap, cells: Cells) -> _Returns | None:
 
 def _on_walls(returns: _Returns, footprint: Footprint) -> _OnWalls:
     index = np.flatnonzero((returns.cell < 0) & (returns.point[:, 2] < footprint.ceiling_m))
-    nearest, strip, piece = (np.full(len(index), v) for v in (footprint.margin_m, -1.0, -1.0))
+    nearest, strip = np.full(len(index), footprint.margin_m), np.full(len(index), -1.0)
     normal, of_fit = np.zeros((len(index), 2)), np.zeros(0, dtype=np.int64)
     for k, fit in enumerate(footprint.fits):
         off = returns.point[index, :2] - fit.point
         across = np.array([fit.direction[1], -fit.direction[0]])
         along_m, away_m = off @ fit.direction + 0.5 * fit.length_m, np.abs(off @ across)
         here = (along_m >= 0.0) & (along_m < fit.length_m) & (away_m < nearest)
-        nearest[here], piece[here] = away_m[here], k
+        nearest[here] = away_m[here]
         strip[here] = len(of_fit) + np.floor(along_m[here] / STRIP_M)
         normal[here] = across
         of_fit = np.append(of_fit, np.full(int(fit.length_m / STRIP_M) + 1, k))
