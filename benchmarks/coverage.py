@@ -103,23 +103,20 @@ def main() -> None:
     every = [report for reports in by_sweep.values() for report in reports]
     if args.by_world:
         worlds = sorted({str(report.get("mission")) for report in every})
-        of_worlds = [world_row(world, [r for r in every if str(r.get("mission")) == world]) for world in worlds]
-        if args.docs is not None:
-            command = f"`python -m benchmarks.coverage --by-world {' '.join(map(str, args.folders))}`"
-            fill_block(args.docs, "coverage_by_world", f"{command}\n\n{table(of_worlds)}")
-        print(json.dumps(of_worlds, indent=2) if args.json else table(of_worlds))
-        return
-    rows = [row(str(folder), reports) for folder, reports in by_sweep.items()]
-    rows.append(row("all", every))
+        rows = [world_row(world, [r for r in every if str(r.get("mission")) == world]) for world in worlds]
+    else:
+        rows = [*(row(str(folder), reports) for folder, reports in by_sweep.items()), row("all", every)]
     if args.docs is not None:
-        command = f"`python -m benchmarks.coverage {' '.join(map(str, args.folders))}`"
-        fill_block(args.docs, "coverage", f"{command}\n\n{table(rows)}")
+        block, option = ("coverage_by_world", " --by-world") if args.by_world else ("coverage", "")
+        command = f"`python -m benchmarks.coverage{option} {' '.join(map(str, args.folders))}`"
+        fill_block(args.docs, block, f"{command}\n\n{table(rows)}")
     print(json.dumps(rows, indent=2) if args.json else table(rows))
+    if args.json or args.by_world:
+        return
     ratio = rows[-1]["inside, %"] / 100.0
-    if not args.json:
-        print(
-            f"wanted: {WANTED[0]:.0%} to {WANTED[1]:.0%}; {'reached' if WANTED[0] <= ratio <= WANTED[1] else 'not reached'}"
-        )
+    print(
+        f"wanted: {WANTED[0]:.0%} to {WANTED[1]:.0%}; {'reached' if WANTED[0] <= ratio <= WANTED[1] else 'not reached'}"
+    )
 
 
 if __name__ == "__main__":

@@ -113,7 +113,6 @@ def _slug(value: object) -> str:
 
 def fly_run(run: SweepRun, *, keep_map: bool = False) -> dict[str, Any]:
     """One flight, anywhere: its report, its parameters, its path in plan, its point map if asked. Runs in a worker."""
-    _one_thread()
     from stockpilot.run import fly_lockstep
 
     mission = load_mission(run.mission, run.settings, seed=run.seed)
@@ -134,7 +133,6 @@ def measure_run(run: SweepRun, *, result: dict[str, Any], map_file: Path) -> dic
 
     What the true poses would give is left out: it needs the flight.
     """
-    _one_thread()
     from companion.volume import estimate_volume
     from stockpilot.results import volume_scores
 
@@ -149,11 +147,6 @@ def measure_run(run: SweepRun, *, result: dict[str, Any], map_file: Path) -> dic
     leans = any(event["name"] == LEANS_EVENT for event in report.get("events", ()))
     volume = replace(volume, warnings=(*volume.warnings, *mount_warnings(turned_by, leans=leans)))
     return {**result, "report": {**report, **volume_scores(volume, report["truth_volume_m3"])}}
-
-
-def _one_thread() -> None:
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
 
 
 def sweep_command(

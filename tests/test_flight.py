@@ -73,7 +73,7 @@ def test_a_sensor_that_reads_too_far_moves_the_volume_as_the_interval_says(flown
     offset_m = 0.03
     drawn = float(stream(flown.mission.seed, "lidar offset").standard_normal())
     assert drawn < 0.0
-    off = fly_lockstep(small_mission(lidar={"offset_sigma_m": offset_m / drawn * -1.0}))
+    off = fly_lockstep(small_mission(lidar={"offset_sigma_m": -offset_m / drawn}))
     assert flown.mission.sim is not None
     own_m = flown.mission.sim.lidar.offset_sigma_m * drawn
     assert off.scored.volume is not None

@@ -37,11 +37,11 @@ LOOSE = 1.0  # information that holds a place or tilt which no wall tells, again
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Returns:
-    """keyframe: (N,) from 0. point: (N, 3) in map; beam: unit, and reach_m: from the body, to it. cell: (N,) flat, -1 off the
-    surface."""
+    """flown: (K,) keyframes of the map, sorted. keyframe: (N,) which of them. point: (N, 3) in map; beam: unit, and reach_m: from
+    the body, to it. cell: (N,) flat, -1 off the surface."""
 
+    flown: Index
     keyframe: Index
-    keyframes: int
     point: Array
     beam: Array
     reach_m: Array
@@ -89,7 +89,7 @@ def bending(
             of_fit = np.isin(on_walls.of_fit, [k for k, f in enumerate(footprint.fits) if f is fit]) & np.isfinite(out)
             per_range += face_m2 * (float(out[of_fit].mean()) if of_fit.any() else 1.0)
     shift = np.zeros((len(returns.keyframe), 3))
-    shift[:, :2] = _by_walls(point_map, footprint)[returns.keyframe]
+    shift[:, :2] = _by_walls(returns.flown, footprint)[returns.keyframe]
     contradicted = _volume(grid, floor, pile_m2, piles, *_rises(returns, grid, surface, shift))
     return Bending(per_range_m2=per_range, contradicted_m3=contradicted or 0.0)
 
@@ -121,8 +121,8 @@ def _returns(point_map: PointMap, cells: Cells) -> _Returns | None:
     reach = points - point_map.path_map[point_map.scan_index[chosen]]
     flown = np.unique(point_map.keyframe_id)
     return _Returns(
+        flown=flown,
         keyframe=np.searchsorted(flown, point_map.keyframe_id[chosen]),
-        keyframes=len(flown),
         point=points,
         beam=reach / np.maximum(np.linalg.norm(reach, axis=1), 1e-9)[:, None],
         reach_m=reach,
@@ -159,13 +159,22 @@ def _places(returns: _Returns, walls: _OnWalls) -> tuple[Array, Array]:
     level = np.abs(returns.beam[walls.index, 2]) < LEVEL_SIN
     index, strip, normal = walls.index[level], walls.strip[level], walls.normal[level]
     keyframe, longer = returns.keyframe[index], np.sum(returns.beam[index, :2] * normal, axis=1)
-    count = np.bincount(strip, minlength=len(walls.of_fit))
-    place, out = np.zeros((returns.keyframes, 2)), np.zeros(len(walls.of_fit))
-    for _ in range(PASSES):
-        seen = longer + np.sum(place[keyframe] * normal, axis=1)
-        out = np.bincount(strip, seen, minlength=len(count)) / np.maximum(count, 1)
-        place = -_solved(normal, longer - out[strip], keyframe, returns.keyframes)
+    place, out, count = _agreed(longer, normal, keyframe, len(returns.flown), strip, len(walls.of_fit))
     return place, np.where(count >= LEAST_IN_STRIP, out, np.nan)
+
+
+def _agreed(
+    away: Array, normal: Array, keyframe: Index, keyframes: int, wall: Index, walls: int
+) -> tuple[Array, Array, Index]:
+    """(K, 2) by how much each keyframe is displaced and (walls,) how far out the walls stand, so that both agree best; (walls,) by
+    how many returns. away: (M,) how far out each return lies. normal: (M, 2) of its wall, outwards."""
+    count = np.bincount(wall, minlength=walls)
+    place, out = np.zeros((keyframes, 2)), np.zeros(walls)
+    for _ in range(PASSES):
+        seen = away + np.sum(place[keyframe] * normal, axis=1)
+        out = np.bincount(wall, seen, minlength=walls) / np.maximum(count, 1)
+        place = -_solved(normal, away - out[wall], keyframe, keyframes)
+    return place, out, count
 
 
 def _tilts(returns: _Returns, walls: _OnWalls, place: Array, out: Array) -> Array:
@@ -175,7 +184,7 @@ def _tilts(returns: _Returns, walls: _OnWalls, place: Array, out: Array) -> Arra
     keyframe, up = returns.keyframe[index], returns.reach_m[index, 2]
     left = np.sum((returns.beam[index, :2] + place[keyframe]) * normal, axis=1) - out[strip]
     rows = np.column_stack([-normal[:, 1] * up, normal[:, 0] * up, normal])
-    return -_solved(rows, left, keyframe, returns.keyframes)[:, :2]
+    return -_solved(rows, left, keyframe, len(returns.flown))[:, :2]
 
 
 def _moved(returns: _Returns, place: Array, tilt: Array) -> Array:
@@ -196,41 +205,35 @@ def _rises(returns: _Returns, grid: Grid, surface: Surface, moved: Array) -> tup
     slope_x, slope_y = surface.slope_x.ravel()[cell], surface.slope_y.ravel()[cell]
     above = moved[:, 2] - slope_x * moved[:, 0] - slope_y * moved[:, 1]
     size = grid.shape[0] * grid.shape[1]
-    in_cell, of_keyframe = np.bincount(cell, minlength=size), np.bincount(keyframe, minlength=returns.keyframes)
-    height, rise = np.zeros(returns.keyframes), np.zeros(size)
+    in_cell, of_keyframe = np.bincount(cell, minlength=size), np.bincount(keyframe, minlength=len(returns.flown))
+    height, rise = np.zeros(len(returns.flown)), np.zeros(size)
     for _ in range(PASSES):
         rise = np.bincount(cell, above + height[keyframe], minlength=size) / np.maximum(in_cell, 1)
-        misfit = np.bincount(keyframe, above - rise[cell], minlength=returns.keyframes)
+        misfit = np.bincount(keyframe, above - rise[cell], minlength=len(returns.flown))
         height = -misfit / np.maximum(of_keyframe, 1)
     known = (in_cell >= LEAST_IN_CELL).reshape(grid.shape)
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return rise.reshape(grid.shape)[tuple(nearest)], known
 
 
-def _by_walls(point_map: PointMap, footprint: Footprint) -> Array:
+def _by_walls(flown: Index, footprint: Footprint) -> Array:
     """(K, 2) from where each keyframe stands to where it would see the walls as all together see them."""
-    flown = np.unique(point_map.keyframe_id)
-    place = np.zeros((len(flown), 2))
-    if not footprint.fits:
-        return place
-    of_fit = np.repeat(np.arange(len(footprint.fits)), [len(fit.members) for fit in footprint.fits])
-    off = np.concatenate([fit.offsets_m for fit in footprint.fits])
-    normal = np.array([(fit.direction[1], -fit.direction[0]) for fit in footprint.fits])[of_fit]
-    keyframe = np.searchsorted(flown, footprint.fit_keyframe[np.concatenate([fit.members for fit in footprint.fits])])
-    count = np.maximum(np.bincount(of_fit, minlength=len(footprint.fits)), 1)
-    for _ in range(PASSES):
-        seen = off + np.sum(place[keyframe] * normal, axis=1)
-        stands = np.bincount(of_fit, seen, minlength=len(count)) / count
-        place = -_solved(normal, off - stands[of_fit], keyframe, len(flown), LOOSE)
-    return place
+    fits = footprint.fits
+    if not fits:
+        return np.zeros((len(flown), 2))
+    of_fit = np.repeat(np.arange(len(fits)), [len(fit.members) for fit in fits])
+    off = np.concatenate([fit.offsets_m for fit in fits])
+    normal = np.array([(fit.direction[1], -fit.direction[0]) for fit in fits])[of_fit]
+    keyframe = np.searchsorted(flown, footprint.fit_keyframe[np.concatenate([fit.members for fit in fits])])
+    return _agreed(off, normal, keyframe, len(flown), of_fit, len(fits))[0]
 
 
-def _solved(rows: Array, values: Array, keyframe: Index, keyframes: int, loose: float = LOOSE) -> Array:
+def _solved(rows: Array, values: Array, keyframe: Index, keyframes: int) -> Array:
     """(K, P) least squares of values (M,) on rows (M, P), of each keyframe on its own; 0 where nothing tells."""
     unknowns = range(rows.shape[1])
     normal = np.array(
         [[np.bincount(keyframe, rows[:, i] * rows[:, j], minlength=keyframes) for j in unknowns] for i in unknowns]
     )
     right = np.array([np.bincount(keyframe, rows[:, i] * values, minlength=keyframes) for i in unknowns])
-    held = normal.transpose(2, 0, 1) + loose * np.eye(rows.shape[1])
+    held = normal.transpose(2, 0, 1) + LOOSE * np.eye(rows.shape[1])
     return np.asarray(np.linalg.solve(held, right.T[..., None])[..., 0])

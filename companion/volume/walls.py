@@ -278,14 +278,14 @@ def _cut_obstacles(
                     f"y {grid.y0_m + y:.1f} m: what is hidden behind it is not known"
                 )
             continue
-        blocked |= ndimage.binary_dilation(ndimage.binary_fill_holes(body), disc(cells_of(footprint.margin_m, grid)))
+        body = ndimage.binary_fill_holes(body)
+        blocked |= ndimage.binary_dilation(body, disc(cells_of(footprint.margin_m, grid)))
         column = measure_column(points[(at == i) & upright, :2], standing, footprint.noise_m)
         if column is not None:
             covered = coverage(column.outline_m, grid)
             share *= np.maximum(1.0 - covered, LEAST_SHARE)
             unsure[covered > 0] = column.sigma_m2 / column.area_m2
             continue
-        body = ndimage.binary_fill_holes(body)
         cells_area = float(body.sum()) * grid.cell_area_m2
         radius = np.sqrt(cells_area / np.pi)
         true_radius = max(radius - 1.2 * footprint.noise_m - 0.3 * grid.cell_m, 0.3 * radius)
